@@ -1,0 +1,60 @@
+"""Stage 01: pi_priv, trained with recurrent PPO on the true state, without occlusion (sec. 4, "Privileged Policy").
+
+    python 01_train_privileged.py [smoke|quick|laptop|paper] [--seed k] [--field value ...]
+
+Writes runs/<preset>/01_train_privileged/seed<k>/: policy.safetensors, value.safetensors, checkpoint_*.safetensors (uniformly spaced over
+training, the untrained net first), metrics.csv, success_rate_priv.png (all seeds that are there). Resumes where it stopped.
+"""
+from dataclasses import dataclass
+
+import torch
+
+from common import artifacts, networks, plots, ppo
+from common.env import PushVectorEnv
+from common.symmetry import Mirrored
+
+
+@dataclass
+class Config(ppo.Hyperparameters, artifacts.Stage):
+    checkpoints: int = 300
+    """uniformly spaced checkpoints of pi_priv, the untrained and the last included (sec. 4)"""
+
+
+PRESETS = {
+    "smoke": dict(num_envs=32, rollout_steps=16, updates=6, minibatch=256, epochs=2, sizes=(16, 16, 16), checkpoints=3,
+                  eval_every=3, eval_episodes=16, resume_every=2, tolerance=4.0, near_share=0.5),
+    "quick": dict(num_envs=1024, rollout_steps=32, updates=800, minibatch=4096, epochs=3, sizes=(64, 128, 64), checkpoints=40,
+                  entropy=0.005, kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.5),
+    "laptop": dict(num_envs=1024, rollout_steps=32, updates=4000, minibatch=4096, epochs=3, checkpoints=100, entropy=0.005,
+                   kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.5),
+    "paper": {},
+}
+
+
+def main(cfg):
+    run = artifacts.Run(cfg, "01_train_privileged")
+    if run.skip():
+        return
+    device = artifacts.device_of(cfg)
+    torch.manual_seed(cfg.seed)
+    pi_priv = networks.policy(8, cfg.sizes).to(device)
+    critic = networks.value(8, cfg.sizes).to(device)
+
+    names = [f"checkpoint_{i:03d}.safetensors" for i in range(cfg.checkpoints)]
+    spaced = {round(i * cfg.updates / (cfg.checkpoints - 1)): i for i in range(cfg.checkpoints)}
+
+    def keep(update, actor):
+        if update in spaced:
+            networks.save_recurrent(run.dir / names[spaced[update]], actor)
+
+    if not ppo.train(run, cfg, lambda n: Mirrored(PushVectorEnv(n)), pi_priv, critic, keep):
+        return
+    networks.save_recurrent(run.dir / "policy.safetensors", pi_priv)
+    networks.save_recurrent(run.dir / "value.safetensors", critic)
+    plots.success_rate_priv(run.dir.parent, run.dir / "success_rate_priv.png")
+    run.finish(["policy.safetensors", "value.safetensors", *names], success=run.rows()[-1]["success"])
+    print(f"{run.dir}: pi_priv succeeds in {run.rows()[-1]['success']:.1%} of held-out episodes")
+
+
+if __name__ == "__main__":
+    artifacts.main(Config, PRESETS, main, __doc__)

@@ -1,0 +1,125 @@
+"""Stage 02: the dataset D, clean trajectories of all checkpoints of pi_priv (sec. 3.2, "Data Collection").
+
+    python 02_collect.py [smoke|quick|laptop|paper] [--field value ...]
+
+Reads the checkpoints of 01. Writes runs/<preset>/02_collect/seed<k>/: for the sets train, validation, test (all checkpoints,
+the same number of whole episodes each) and teacher_train, teacher_validation (the last checkpoint) <set>_states.npy
+(steps, 7) float32 in SI units and <set>_offsets.npy (n + 1,); metrics.csv and success.png of the checkpoints.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from common import artifacts, networks, plots, ppo, task, trajectories
+from common.env import PushVectorEnv
+from common.symmetry import Mirrored
+
+SETS = ("train", "validation", "test", "teacher_train", "teacher_validation")
+
+
+@dataclass
+class Config(artifacts.Stage):
+    train: int = 750_000
+    """trajectories to train on, of all checkpoints; the teacher set of the last one has as many (appendix B.2, B.3)"""
+    validation: int = 150_000
+    """trajectories to validate on, likewise (appendix B.2, B.3)"""
+    test: int = 150_000
+    """trajectories to test the estimators on (appendix B.2)"""
+    num_envs: int = 2500
+    """most worlds at once"""
+
+
+PRESETS = {
+    "smoke": dict(train=48, validation=12, test=12, num_envs=16),
+    "quick": dict(train=20_000, validation=1000, test=2000, num_envs=1000),
+    "laptop": dict(train=60_000, validation=3000, test=6000, num_envs=1000),
+    "paper": {},
+}
+
+
+def jobs(cfg, checkpoints):
+    """(set, checkpoint, episodes) of every part: at most cfg.num_envs whole episodes of one checkpoint."""
+    for name in SETS:
+        count = getattr(cfg, name.removeprefix("teacher_"))
+        players = [checkpoints - 1] if name.startswith("teacher") else range(checkpoints)
+        share = [count * (i + 1) // len(players) - count * i // len(players) for i in range(len(players))]
+        for player, episodes in zip(players, share):
+            for first in range(0, episodes, cfg.num_envs):
+                yield name, player, min(cfg.num_envs, episodes - first)
+
+
+def collect(policy, episodes, seed):
+    """States (steps, 7) and lengths of one episode in each of `episodes` worlds, actions sampled; and their success."""
+    states = np.empty((task.HORIZON, episodes, 7), np.float32)
+
+    def record(t, obs, env, running):
+        states[t] = env.unwrapped.state
+
+    torch.manual_seed(seed)
+    success, length = ppo.play(Mirrored(PushVectorEnv(episodes)), policy, seed, greedy=False, record=record)
+    valid = np.arange(task.HORIZON)[:, None] < length
+    return states.swapaxes(0, 1)[valid.T], length, success
+
+
+def join(run, name, parts):
+    """Parts of a set as one array of states and one of offsets; returns the lengths."""
+    lengths = np.concatenate([np.load(p)["length"] for p in parts])
+    offsets = np.concatenate([[0], lengths.cumsum()])
+
+    def write(path):
+        states = np.lib.format.open_memmap(path, "w+", np.float32, (offsets[-1], 7))
+        end = 0
+        for part in parts:
+            chunk = np.load(part)["states"]
+            states[end:end + len(chunk)] = chunk
+            end += len(chunk)
+        states.flush()
+
+    for file, writer in zip(trajectories.files(name), (write, lambda path: np.save(path, offsets))):
+        artifacts.write_atomic(run.dir / file, writer)
+    return lengths
+
+
+def main(cfg):
+    folder = artifacts.find(cfg, "01_train_privileged", "policy.safetensors").parent
+    paths = [artifacts.find(cfg, "01_train_privileged", p.name) for p in sorted(folder.glob("checkpoint_*"))]
+    run = artifacts.Run(cfg, "02_collect", {p.name: p for p in paths})
+    if run.skip():
+        return
+    device = artifacts.device_of(cfg)
+    todo = list(jobs(cfg, len(paths)))
+    parts = [run.dir / f"part_{k:05d}.npz" for k in range(len(todo))]
+    left = [k for k, part in enumerate(parts) if not part.exists()]
+    bar = artifacts.bar(sum(todo[k][2] for k in left), "02_collect", unit="trajectory")
+    for k in left:
+        name, player, episodes = todo[k]
+        policy = networks.load_recurrent(paths[player], device)
+        seed = int(np.random.SeedSequence([cfg.seed, k]).generate_state(1)[0])
+        states, length, success = collect(policy, episodes, seed)
+        artifacts.write_atomic(parts[k], lambda path: np.savez(path, states=states, length=length, success=success))
+        bar.update(episodes)
+        if run.out_of_time():
+            return run.stop()
+    bar.close()
+
+    success = [[] for _ in paths]
+    for (name, player, _), part in zip(todo, parts):
+        success[player] += np.load(part)["success"].tolist()
+    for player, ended in enumerate(success):
+        run.log(checkpoint=player, episodes=len(ended), success=np.mean(ended))
+    for name in SETS:
+        lengths = join(run, name, [part for job, part in zip(todo, parts) if job[0] == name])
+        quartiles = np.percentile(lengths, [0, 25, 50, 75, 100])
+        size = (run.dir / trajectories.files(name)[0]).stat().st_size / 2**20
+        print(f"{name}: {len(lengths):,} trajectories, {lengths.sum():,} steps, lengths {quartiles.astype(int)}, {size:,.0f} MiB")
+    plots.checkpoints(run.rows(), run.dir / "success.png")
+    rate = sum(job[2] for job in todo) / run.minutes() / 60
+    print(f"{run.dir}: {rate:,.0f} trajectories/s; success of the checkpoints " + " ".join(f"{np.mean(s):.0%}" for s in success))
+    run.finish([file for name in SETS for file in trajectories.files(name)])
+    for part in parts:
+        part.unlink()
+
+
+if __name__ == "__main__":
+    artifacts.main(Config, PRESETS, main, __doc__)

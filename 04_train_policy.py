@@ -1,0 +1,131 @@
+"""Stage 04: the control policies under occlusion, each another stack over the same env (sec. 3.3, sec. 5.2).
+
+    python 04_train_policy.py [smoke|quick|laptop|paper] [--method est_uncertainty|est|est_mse|end_to_end|behavior_cloning]
+        [--seed k] [--field value ...]
+
+Reads pi_priv (01), the teacher sets (02) and the estimators (03). Writes runs/<preset>/04_train_policy/<method>/seed<k>/:
+policy.safetensors, metrics.csv, and success_rate.png of all methods and seeds or bc_loss.png. Without --method all are
+trained in turn.
+"""
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+
+from common import artifacts, networks, plots, ppo, stacks, supervised, symmetry, trajectories
+
+METHODS = ("est_uncertainty", "est", "est_mse", "end_to_end", "behavior_cloning")
+
+
+@dataclass
+class Config(ppo.Hyperparameters, artifacts.Stage):
+    method: Literal["est_uncertainty", "est", "est_mse", "end_to_end", "behavior_cloning", "all"] = "all"
+    """which policy to train"""
+    passes: int = 50
+    """M, stochastic passes of the estimator in the loop (sec. 4)"""
+    warm_start: bool = False
+    """aid: the RL methods, end_to_end included, start from pi_priv's weights, new inputs at zero"""
+    bc_sequences: int = 100
+    """behaviour cloning: trajectories per mini-batch (tab. estimator_hyperparameters)"""
+    bc_epochs: int = 110
+    """behaviour cloning: passes over the teacher set (tab. estimator_hyperparameters)"""
+    bc_lr: float = 1e-3
+    """behaviour cloning: Adam's learning rate (tab. estimator_hyperparameters)"""
+    bc_lr_end: float = 1e-3
+    """behaviour cloning: learning rate at the end of a cosine; the paper's stays constant"""
+    bc_validation: int = 150_000
+    """behaviour cloning: most trajectories of a validation (appendix B.3)"""
+
+
+_QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy=0.005, kl_target=0.015, lr=3e-4, lr_min=1e-4,
+              lr_max=2e-3, tolerance=1.0, near_share=0.5, warm_start=True)
+PRESETS = {
+    "smoke": dict(num_envs=32, rollout_steps=16, updates=4, minibatch=256, epochs=2, sizes=(16, 16, 16), eval_every=2,
+                  eval_episodes=16, resume_every=2, passes=2, bc_sequences=16, bc_epochs=2, bc_validation=12, warm_start=True),
+    "quick": _QUICK | dict(updates=120, sizes=(64, 128, 64), passes=4, bc_sequences=50, bc_epochs=2, bc_lr_end=5e-5, bc_validation=500),
+    "laptop": _QUICK | dict(updates=2000, passes=10, bc_sequences=64, bc_epochs=15, bc_lr_end=5e-5, bc_validation=1000),
+    "paper": {},
+}
+
+
+def inputs_of(cfg):
+    """Paths of what a method reads."""
+    paths = {name: artifacts.find(cfg, "01_train_privileged", f"{name}.safetensors") for name in ("policy", "value")}
+    if cfg.method == "behavior_cloning":
+        return paths | trajectories.load_set(cfg, "teacher_train")[1] | trajectories.load_set(cfg, "teacher_validation")[1]
+    if kind := stacks.ESTIMATOR[cfg.method]:
+        paths["estimator"] = artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", kind)
+    return paths
+
+
+def start_from(net, trained):
+    """Copies pi_priv's (or its value net's) weights into a net with further inputs, whose weights become zero."""
+    weights = trained.state_dict()
+    wide = torch.zeros_like(net.encoder.weight)
+    wide[:, :trained.inputs] = weights["encoder.weight"]
+    net.load_state_dict(weights | {"encoder.weight": wide})
+
+
+def train_rl(run, cfg, paths, device):
+    """Recurrent PPO on the method's stack (sec. 3.3). Returns the policy, None when the time limit stopped it."""
+    estimator = networks.load_estimator(paths["estimator"], device) if "estimator" in paths else None
+
+    def make_env(num_envs):
+        return stacks.make(cfg.method, num_envs, estimator, cfg.passes)
+
+    torch.manual_seed(cfg.seed)
+    inputs = make_env(1).single_observation_space.shape[0]
+    pi, critic = networks.policy(inputs, cfg.sizes).to(device), networks.value(inputs, cfg.sizes).to(device)
+    if cfg.warm_start:
+        start_from(pi, networks.load_recurrent(paths["policy"], device))
+        start_from(critic, networks.load_recurrent(paths["value"], device))
+    return pi if ppo.train(run, cfg, make_env, pi, critic) else None
+
+
+def train_bc(run, cfg, paths, device):
+    """Teacher-student behaviour cloning on pi_priv's trajectories (appendix B.3): the policy of the lowest validation loss."""
+    teacher = networks.load_recurrent(paths["policy"], device)
+    torch.manual_seed(cfg.seed)
+    student = networks.policy(9, cfg.sizes).to(device)
+
+    def loss(data, index, seed):
+        """Sum over both velocities of the cross-entropy with the teacher's distribution, in the mirrored frame of both."""
+        o, s, mask = (x.cpu().numpy() for x in trajectories.observe(data, index, seed, device))
+        sign = symmetry.signs(s[0])
+        o, s, mask = (torch.as_tensor(x, device=device) for x in (symmetry.mirror(o, sign), symmetry.mirror(s, sign), mask))
+        with networks.autocast(device):
+            with torch.no_grad():
+                target = networks.log_softmax(teacher(s)[0]).exp()
+            logp = networks.log_softmax(student(o)[0])
+        steps = mask.sum()
+        return (-(target * logp).sum((-1, -2)) * mask).sum() / steps, steps.item()
+
+    done = supervised.fit(
+        run, student, loss, lambda: networks.save_recurrent(run.dir / "policy.safetensors", student),
+        trajectories.load_set(cfg, "teacher_train")[0], trajectories.load_set(cfg, "teacher_validation")[0],
+        seed=cfg.seed, sequences=cfg.bc_sequences, epochs=cfg.bc_epochs, lr=cfg.bc_lr, lr_end=cfg.bc_lr_end,
+        grad_norm=cfg.grad_norm, validation=cfg.bc_validation)
+    return networks.load_recurrent(run.dir / "policy.safetensors", device) if done else None
+
+
+def main(cfg):
+    device = artifacts.device_of(cfg)
+    for method in METHODS if cfg.method == "all" else [cfg.method]:
+        cfg = replace(cfg, method=method)
+        paths = inputs_of(cfg)
+        run = artifacts.Run(cfg, "04_train_policy", paths, method)
+        if run.skip():
+            continue
+        pi = (train_bc if method == "behavior_cloning" else train_rl)(run, cfg, paths, device)
+        if pi is None:
+            return
+        networks.save_recurrent(run.dir / "policy.safetensors", pi)
+        if method == "behavior_cloning":
+            plots.validation_loss(run.dir.parent.parent, "bc_loss", run.dir / "bc_loss.png")
+        else:
+            plots.success_rate(run.dir.parent.parent, run.dir / "success_rate.png")
+        run.finish(["policy.safetensors"])
+
+
+if __name__ == "__main__":
+    artifacts.main(Config, PRESETS, main, __doc__)

@@ -1,0 +1,167 @@
+"""The recurrent policy and value nets (appendix B.1), and the state estimator with its uncertainty (sec. 3.2)."""
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from common import artifacts
+from common.task import BINS
+
+LOG_VAR = (-14.0, 4.0)  # clamp of the predicted log-variances
+
+
+def autocast(device):
+    """bfloat16 autocast where the machine computes in it, else float32."""
+    device = torch.device(device)
+    fast = torch.cuda.is_bf16_supported() if device.type == "cuda" else torch.cpu._is_avx512_bf16_supported()
+    return torch.autocast(device.type, torch.bfloat16, enabled=fast)
+
+
+class Recurrent(nn.Module):
+    """linear, LSTM, linear, linear with tanh between: the paper's 128, 256, 128 and the outputs.
+
+    Args:
+        inputs, outputs: sizes of the first and last layer.
+        sizes: the three hidden sizes.
+        memory: without it the LSTM is left out (a feed-forward net, for comparison in the tests).
+    """
+
+    def __init__(self, inputs, outputs, sizes=(128, 256, 128), memory=True):
+        super().__init__()
+        self.inputs, self.sizes, self.memory = inputs, sizes, memory
+        self.encoder = nn.Linear(inputs, sizes[0])
+        self.lstm = nn.LSTM(sizes[0], sizes[1]) if memory else nn.Linear(sizes[0], sizes[1])
+        self.head = nn.Sequential(nn.Linear(sizes[1], sizes[2]), nn.Tanh(), nn.Linear(sizes[2], outputs))
+
+    def forward(self, x, hidden=None):
+        """Outputs (T, B, outputs) float32 and the next hidden state of inputs (T, B, inputs); no hidden state is zeros."""
+        z = torch.tanh(self.encoder(x))
+        if self.memory:
+            z, hidden = self.lstm(z, hidden)
+        else:
+            z = torch.tanh(self.lstm(z))
+        return self.head(z).float(), hidden
+
+    def initial(self, batch, device=None):
+        return tuple(torch.zeros(1, batch, self.sizes[1], device=device) for _ in range(2))
+
+
+def policy(inputs, sizes=(128, 256, 128), memory=True):
+    """Net with 22 logits: 11 velocities along x, 11 along y. Starts near the uniform distribution."""
+    net = Recurrent(inputs, 2 * BINS, sizes, memory)
+    with torch.no_grad():
+        net.head[-1].weight *= 0.01
+        net.head[-1].bias.zero_()
+    return net
+
+
+def value(inputs, sizes=(128, 256, 128), memory=True):
+    return Recurrent(inputs, 1, sizes, memory)
+
+
+def log_softmax(logits):
+    """Log-probabilities (..., 2, 11) of the two categorical velocities from logits (..., 22)."""
+    return F.log_softmax(logits.unflatten(-1, (2, BINS)), -1)
+
+
+def log_prob(logp, actions):
+    """Log-probability (...) of actions (..., 2) under log-probabilities (..., 2, 11)."""
+    return logp.gather(-1, actions.unsqueeze(-1)).squeeze(-1).sum(-1)
+
+
+def sample(logits):
+    """Actions (..., 2) drawn from logits (..., 22), by the Gumbel trick."""
+    logits = logits.unflatten(-1, (2, BINS))
+    return (logits - torch.empty_like(logits).exponential_().log_()).argmax(-1)
+
+
+def mode(logits):
+    """The most probable actions (..., 2) of logits (..., 22)."""
+    return logits.unflatten(-1, (2, BINS)).argmax(-1)
+
+
+def forget(hidden, worlds):
+    """Hidden state (tuple of (1, B, H)) with zeros where `worlds` (B,) bool is set."""
+    return tuple(h * (~worlds)[None, :, None] for h in hidden)
+
+
+class Estimator(nn.Module):
+    """f: LSTM 1024, then linear 512, 256, 8 with tanh and dropout before every linear layer (sec. 4).
+
+    Args:
+        sizes: of the LSTM and the two hidden linear layers.
+        dropout: probability; 0 for the likelihood and MSE variants.
+        likelihood: predict log-variances too (8 outputs), else the pose alone (4, MSE).
+    """
+
+    def __init__(self, sizes=(1024, 512, 256), dropout=0.2, likelihood=True):
+        super().__init__()
+        self.sizes, self.dropout, self.likelihood = tuple(sizes), dropout, likelihood
+        self.lstm = nn.LSTM(9, sizes[0])
+        self.layers = nn.ModuleList([nn.Linear(sizes[0], sizes[1]), nn.Linear(sizes[1], sizes[2]),
+                                     nn.Linear(sizes[2], 8 if likelihood else 4)])
+
+    def head(self, z):
+        """Poses (..., 4) and log-variances (..., 4) or None of features (..., H), with a fresh dropout mask each call."""
+        for i, layer in enumerate(self.layers):
+            z = layer(F.dropout(z, self.dropout) if self.dropout else z)  # at training and testing time
+            if i < 2:
+                z = torch.tanh(z)
+        q, log_var = z.float().split(4, -1) if self.likelihood else (z.float(), None)
+        return q, log_var.clamp(*LOG_VAR) if self.likelihood else None
+
+    def forward(self, o, hidden=None):
+        """One stochastic pass: pose (T, B, 4), log-variances and the hidden state of observations (T, B, 9)."""
+        z, hidden = self.lstm(o, hidden)
+        return *self.head(z), hidden
+
+    def predict(self, o, hidden=None, passes=50):
+        """Predictive mean (T, B, 4), total variance (T, B, 4) (eqs. 3, 4) and hidden state: LSTM once, head `passes` times."""
+        z, hidden = self.lstm(o, hidden)
+        passes = passes if self.dropout else 1
+        at_once = max(1, 2**15 // (z.shape[0] * z.shape[1]))  # bounds the memory; a single world runs all passes at once
+        heads = [self.head(z.expand(min(at_once, passes - i), *z.shape)) for i in range(0, passes, at_once)]
+        q, log_var = zip(*heads)
+        return *predictive(torch.cat(q), torch.cat(log_var) if self.likelihood else None), hidden
+
+
+def predictive(q, log_var):
+    """Mean and total variance over the first axis: E[q], E[sigma_ale^2] + E[(q - E[q])^2] (eqs. 3, 4), the diagonal."""
+    mean = q.mean(0)
+    sigma_epi2 = (q - mean).square().mean(0)
+    return mean, sigma_epi2 if log_var is None else log_var.exp().mean(0) + sigma_epi2
+
+
+def nll(q, log_var, target, mask):
+    """Eq. 1 with a diagonal covariance, averaged over the valid steps of `mask` (T, B)."""
+    loss = 0.5 * (log_var + (target - q).square() * (-log_var).exp()).sum(-1)
+    return (loss * mask).sum() / mask.sum()
+
+
+def mse(q, target, mask):
+    """Mean squared error over the four components and the valid steps of `mask` (T, B)."""
+    return ((target - q).square().mean(-1) * mask).sum() / mask.sum()
+
+
+def save_recurrent(path, net):
+    """Writes a policy or value net as safetensors, with its sizes."""
+    artifacts.save_tensors(path, net, inputs=net.inputs, outputs=net.head[-1].out_features, sizes=net.sizes)
+
+
+def load_recurrent(path, device="cpu"):
+    tensors, meta = artifacts.load_tensors(path)
+    return _filled(Recurrent(**meta), tensors, device)
+
+
+def save_estimator(path, net):
+    """Writes an estimator as safetensors, with its sizes and kind."""
+    artifacts.save_tensors(path, net, sizes=net.sizes, dropout=net.dropout, likelihood=net.likelihood)
+
+
+def load_estimator(path, device="cpu"):
+    tensors, meta = artifacts.load_tensors(path)
+    return _filled(Estimator(**meta), tensors, device)
+
+
+def _filled(net, tensors, device):
+    net.load_state_dict({name: x.float() for name, x in tensors.items()})
+    return net.to(device).requires_grad_(False)

@@ -1,0 +1,314 @@
+"""Recurrent PPO (Schulman et al. 2017) with the paper's hyper-parameters: rollout, gae, update, and the loop around them.
+
+PPO sees only a vector env: every policy of the study is another stack of wrappers.
+"""
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from common import artifacts, task
+from common.networks import autocast, forget, log_prob, log_softmax, mode, sample
+
+
+@dataclass
+class Hyperparameters:
+    num_envs: int = 4000
+    """parallel worlds (tab. hyperparameters)"""
+    rollout_steps: int = 100
+    """steps of each world per update (tab. hyperparameters)"""
+    updates: int = 2000
+    """rollouts, each followed by an update; the paper gives no number"""
+    minibatch: int = 25000
+    """steps per mini-batch (tab. hyperparameters)"""
+    epochs: int = 5
+    """passes over a rollout (tab. hyperparameters)"""
+    clip: float = 0.2
+    """clip range epsilon (tab. hyperparameters)"""
+    gamma: float = 0.993
+    """discount factor (tab. hyperparameters)"""
+    lam: float = 0.95
+    """GAE parameter lambda (tab. hyperparameters)"""
+    entropy: float = 0.01
+    """entropy loss coefficient (tab. hyperparameters)"""
+    value: float = 1.0
+    """value loss coefficient (tab. hyperparameters)"""
+    kl_target: float = 7e-3
+    """target of the KL-adaptive learning rate (appendix B.1)"""
+    lr_min: float = 1.5e-4
+    """least learning rate (appendix B.1)"""
+    lr_max: float = 1e-2
+    """greatest learning rate (appendix B.1)"""
+    lr: float = 1e-3
+    """first learning rate; the paper gives none"""
+    grad_norm: float = 1.0
+    """clip of the gradient norm, policy and value apart; the paper names none"""
+    sizes: tuple[int, int, int] = (128, 256, 128)
+    """linear, LSTM and linear layer of the policy and value nets (appendix B.1)"""
+    tolerance: float = 1.0
+    """aid: first factor on the success tolerance, lowered by 5 % after 512 episodes of which 60 % succeed; 1 is none"""
+    near_share: float = 0.0
+    """aid: share of training episodes that start with the box nearer to the target and the pusher beside it; 0 is none"""
+    eval_every: int = 20
+    """updates between measurements of the success rate (study's starts, 1x tolerance, worlds that no update sees)"""
+    eval_episodes: int = 500
+    """episodes of such a measurement"""
+    resume_every: int = 50
+    """updates between resume points; there all worlds start anew"""
+
+STATS = ("kl", "entropy", "value_loss", "ratio", "lr", "explained")  # of an update, in metrics.csv
+
+
+def rollout(env, actor, critic, carry, steps):
+    """Plays `steps` steps with sampled actions.
+
+    Args:
+        carry: observations (N, D) and the hidden states of actor and critic, each with its own (h, c).
+    Returns:
+        batch: obs (T, N, D), actions (T, N, 2), logp (T, N, 2, 11), reward, terminated, done (T, N), final (T, N, D; set
+        where done, and the next observation in the last row), success (episodes, successes), hidden_pi and hidden_v
+        at the start; and the next carry.
+    """
+    device = next(actor.parameters()).device
+    obs, hidden_pi, hidden_v = carry
+    n, d = obs.shape
+    b = {"obs": np.empty((steps, n, d), np.float32), "final": np.zeros((steps, n, d), np.float32),
+         "reward": np.empty((steps, n), np.float32), "terminated": np.empty((steps, n), bool),
+         "done": np.empty((steps, n), bool)}
+    actions, logps, successes = [], [], 0
+    start = {"hidden_pi": hidden_pi, "hidden_v": hidden_v}
+    for t in range(steps):
+        b["obs"][t] = obs
+        x = torch.as_tensor(obs, device=device)[None]
+        with torch.no_grad(), autocast(device):
+            logits, hidden_pi = actor(x, hidden_pi)
+            _, hidden_v = critic(x, hidden_v)
+        action = sample(logits[0])
+        actions.append(action)
+        logps.append(log_softmax(logits[0]))
+        obs, b["reward"][t], b["terminated"][t], truncated, infos = env.step(action.cpu().numpy())
+        b["done"][t] = b["terminated"][t] | truncated
+        if "final_obs" in infos:
+            b["final"][t] = infos["final_obs"]
+            ended = torch.as_tensor(b["done"][t], device=device)
+            hidden_pi, hidden_v = forget(hidden_pi, ended), forget(hidden_v, ended)
+            successes += int((infos["success"] & b["done"][t]).sum()) if "success" in infos else 0
+    b["final"][-1] = np.where(b["done"][-1][:, None], b["final"][-1], obs)
+    batch = {k: torch.as_tensor(v, device=device) for k, v in b.items()}
+    batch |= start | {"actions": torch.stack(actions), "logp": torch.stack(logps)}
+    batch["success"] = (int(b["done"].sum()), successes)
+    return batch, (obs, hidden_pi, hidden_v)
+
+
+def split(done):
+    """Where each step of a rollout goes when it is split at episode ends and padded to whole sequences.
+
+        world 0:  a a a | b b        ->  a a a
+        world 1:  c c c c c              b b .
+                                         c c c c c
+
+    Args:
+        done: (T, N) bool.
+    Returns:
+        position (T, N) in the sequence, sequence (T, N), and the first world (S,) and start (S,) of each sequence.
+    """
+    steps, n = done.shape
+    begins = torch.ones_like(done)
+    begins[1:] = done[:-1]
+    flat = begins.T.flatten()
+    sequence = flat.cumsum(0) - 1
+    first = flat.nonzero().squeeze(1)
+    position = torch.arange(steps * n, device=done.device) - first[sequence]
+    return position.view(n, steps).T, sequence.view(n, steps).T, first // steps, first % steps
+
+
+def pad(x, position, sequence, length=None):
+    """Steps (T, N, ...) as padded sequences (L, S, ...)."""
+    length = length or int(position.max()) + 1
+    out = x.new_zeros(length, int(sequence.max()) + 1, *x.shape[2:])
+    out[position, sequence] = x
+    return out
+
+
+def gae(reward, value, next_value, terminated, done, gamma, lam):
+    """Generalised advantages (T, N). A time limit bootstraps from the value of the final observation; a termination does not."""
+    # TD error: r_t + gamma * V(s_{t+1}) - V(s_t)
+    delta = reward + gamma * next_value * ~terminated - value
+    advantage = torch.zeros_like(delta)
+    last = torch.zeros_like(delta[0])
+    for t in reversed(range(len(delta))):
+        # A_t = delta_t + gamma * lambda * A_{t+1}
+        last = delta[t] + gamma * lam * last * ~done[t]
+        advantage[t] = last
+    return advantage
+
+
+def sequences(batch, critic, gamma, lam):
+    """A rollout as padded sequences (L, S, ...), with advantages, returns and the hidden states at their starts."""
+    position, sequence, world, start = split(batch["done"])
+    # One more row holds what follows a sequence's last step, so that one fused pass gives V(s_t) and V(s_{t+1}).
+    obs = pad(batch["obs"], position, sequence, int(position.max()) + 2)
+    last = batch["done"].clone()
+    last[-1] = True
+    obs[position[last] + 1, sequence[last]] = batch["final"][last]
+
+    def at_start(hidden):
+        return tuple(h[:, world] * (start == 0)[None, :, None] for h in hidden)
+
+    hidden_pi, hidden_v = at_start(batch["hidden_pi"]), at_start(batch["hidden_v"])
+    with torch.no_grad(), autocast(obs.device):
+        v = critic(obs, hidden_v)[0].squeeze(-1)
+    value, next_value = v[position, sequence], v[position + 1, sequence]
+    advantage = gae(batch["reward"], value, next_value, batch["terminated"], batch["done"], gamma, lam)
+    returns = advantage + value
+    explained = 1 - (returns - value).var() / returns.var()
+    advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+
+    def padded(x):
+        return pad(x, position, sequence)
+
+    return {"obs": obs[:-1], "hidden_pi": hidden_pi, "hidden_v": hidden_v, "actions": padded(batch["actions"]),
+            "logp": padded(batch["logp"]), "advantage": padded(advantage), "returns": padded(returns),
+            "mask": padded(torch.ones_like(batch["reward"])), "explained": explained.item()}
+
+
+def losses(actor, critic, seq, cols, hp):
+    """Clipped surrogate, entropy, value loss, KL and ratio of the sequences `cols`, averaged over valid steps."""
+    mask = seq["mask"][:, cols]
+    rows = int(mask.sum(0).max())
+    mask = mask[:rows]
+    obs, actions, old, advantage, returns = (seq[k][:rows, cols] for k in ("obs", "actions", "logp", "advantage", "returns"))
+    with autocast(obs.device):
+        logits = actor(obs, tuple(h[:, cols] for h in seq["hidden_pi"]))[0]
+        v = critic(obs, tuple(h[:, cols] for h in seq["hidden_v"]))[0].squeeze(-1)
+    logp = log_softmax(logits)
+    ratio = (log_prob(logp, actions) - log_prob(old, actions)).exp()
+
+    def mean(x):
+        return (x * mask).sum() / mask.sum()
+
+    surrogate = mean(torch.minimum(ratio * advantage, ratio.clamp(1 - hp.clip, 1 + hp.clip) * advantage))
+    entropy = mean(-(logp.exp() * logp).sum((-1, -2)))
+    value_loss = mean((v - returns).square())
+    kl = mean((old.exp() * (old - logp)).sum((-1, -2))).detach()
+    return surrogate, entropy, value_loss, kl, torch.where(mask > 0, ratio.detach(), 1.0)
+
+
+def update(actor, critic, optimizer, seq, hp):
+    """`hp.epochs` passes of PPO over a rollout's sequences; the learning rate follows the KL of the last pass.
+
+    Returns:
+        kl, entropy, value_loss, ratio (largest |ratio - 1| at the first mini-batch) and lr.
+    """
+    count = seq["mask"].shape[1]
+    batches = max(1, round(seq["mask"].sum().item() / hp.minibatch))
+    device = seq["mask"].device
+    first_ratio, kls, entropies, value_losses = None, [], [], []
+    for epoch in range(hp.epochs):
+        for cols in torch.randperm(count).to(device).chunk(batches):
+            surrogate, entropy, value_loss, kl, ratio = losses(actor, critic, seq, cols, hp)
+            first_ratio = (ratio - 1).abs().max() if first_ratio is None else first_ratio
+            optimizer.zero_grad(set_to_none=True)
+            (-surrogate - hp.entropy * entropy + hp.value * value_loss).backward()
+            for net in (actor, critic):  # apart, or the value's gradient drowns the policy's
+                torch.nn.utils.clip_grad_norm_(net.parameters(), hp.grad_norm)
+            optimizer.step()
+            if epoch == hp.epochs - 1:
+                kls.append(kl), entropies.append(entropy.detach()), value_losses.append(value_loss.detach())
+    kl, entropy, value_loss = (torch.stack(x).mean().item() for x in (kls, entropies, value_losses))
+    lr = optimizer.param_groups[0]["lr"]
+    lr = max(hp.lr_min, lr / 1.5) if kl > 2 * hp.kl_target else min(hp.lr_max, lr * 1.5) if kl < hp.kl_target / 2 else lr
+    for group in optimizer.param_groups:
+        group["lr"] = lr
+    return {"kl": kl, "entropy": entropy, "value_loss": value_loss, "ratio": first_ratio.item(), "lr": lr}
+
+
+@torch.no_grad()
+def play(env, actor, seed, greedy=True, record=None):
+    """Plays one whole episode in every world: the first after `reset(seed)`.
+
+    Args:
+        actor: policy net on the env's observations.
+        greedy: the mode of each categorical, else a sample.
+        record: called as record(t, obs, env, running) before each action.
+    Returns:
+        success (N,) bool and length (N,) in steps.
+    """
+    device = next(actor.parameters()).device
+    obs, _ = env.reset(seed=seed)
+    running, success = np.ones(len(obs), bool), np.zeros(len(obs), bool)
+    length, hidden = np.zeros(len(obs), int), None
+    for t in range(task.HORIZON):
+        if record:
+            record(t, obs, env, running)
+        with autocast(device):
+            logits, hidden = actor(torch.as_tensor(obs, device=device)[None], hidden)
+        action = (mode if greedy else sample)(logits[0])
+        obs, _, terminated, truncated, infos = env.step(action.cpu().numpy())
+        length += running
+        success |= running & infos["success"]
+        running &= ~(terminated | truncated)
+        if not running.any():
+            break
+    return success, length
+
+
+def train(run, hp, make_env, actor, critic, keep=None):
+    """PPO from the last resume point to `hp.updates`; every `hp.eval_every` updates a row of metrics.
+
+    Args:
+        run: artifacts.Run, for metrics, resume points and the time limit.
+        hp: Hyperparameters, with the stage's seed.
+        make_env: make_env(num_envs) returns a stack of wrappers over a PushVectorEnv.
+        keep: keep(update, actor), called before each update and after the last, for checkpoints.
+    Returns:
+        True when trained to the end, False when the time limit stopped it.
+    """
+    device = next(actor.parameters()).device
+    env, held_out = make_env(hp.num_envs), make_env(hp.eval_episodes)
+    aids = env.unwrapped
+    aids.tolerance, aids.near_share = hp.tolerance, hp.near_share
+    optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=hp.lr, eps=1e-5)
+    first, episodes, successes = 0, 0, 0
+    if state := run.load_resume():
+        actor.load_state_dict(state["actor"]), critic.load_state_dict(state["critic"])
+        optimizer.load_state_dict(state["optimizer"])
+        first, episodes, successes, aids.tolerance = (state[k] for k in ("update", "episodes", "successes", "tolerance"))
+    bar = artifacts.bar(hp.updates, run.dir.parent.name, initial=first, unit="update")
+    clock, played, stats = time.perf_counter(), 0, dict.fromkeys(STATS, float("nan"))
+    for k in range(first, hp.updates + 1):
+        if keep:
+            keep(k, actor)
+        if (k % hp.eval_every == 0 or k == hp.updates) and (k > first or not k):
+            with torch.random.fork_rng():
+                torch.manual_seed(hp.seed)
+                success = play(held_out, actor, seed=10**6 + hp.seed)[0].mean()
+            rate, clock, played = played / max(time.perf_counter() - clock, 1e-9), time.perf_counter(), 0
+            row = dict(update=k, steps=k * hp.num_envs * hp.rollout_steps, success=success, tolerance=aids.tolerance)
+            run.log(**row, **stats, steps_per_s=rate)
+            bar.set_postfix_str(f"success {success:.1%}, tolerance {aids.tolerance:.2f}x, {rate:,.0f} steps/s")
+        if k == hp.updates:
+            break
+        if k % hp.resume_every == 0:  # all worlds start anew here, in an uninterrupted run too
+            if k > first:
+                run.save_resume(dict(update=k, actor=actor.state_dict(), critic=critic.state_dict(), tolerance=aids.tolerance,
+                                     optimizer=optimizer.state_dict(), episodes=episodes, successes=successes))
+                if run.out_of_time():
+                    run.stop()
+                    return False
+            draw = int(np.random.SeedSequence([hp.seed, k]).generate_state(1)[0])
+            torch.manual_seed(draw)
+            obs, _ = env.reset(seed=draw)
+            carry = obs, actor.initial(hp.num_envs, device), critic.initial(hp.num_envs, device)
+        batch, carry = rollout(env, actor, critic, carry, hp.rollout_steps)
+        seq = sequences(batch, critic, hp.gamma, hp.lam)
+        stats = update(actor, critic, optimizer, seq, hp) | {"explained": seq["explained"]}
+        episodes, successes = episodes + batch["success"][0], successes + batch["success"][1]
+        if episodes >= 512:
+            if successes > 0.6 * episodes:
+                aids.tolerance = max(1.0, 0.95 * aids.tolerance)
+            episodes = successes = 0
+        played += hp.num_envs * hp.rollout_steps
+        bar.update()
+    return True

@@ -1,0 +1,56 @@
+"""Training on stored trajectories, for the estimators and for behaviour cloning (appendix B.2, B.3)."""
+import math
+
+import numpy as np
+import torch
+
+from common import artifacts, trajectories
+
+
+def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr_end, grad_norm, validation):
+    """Adam over shuffled trajectories; an epoch is a resume point and draws its noise and occlusions afresh.
+
+    Args:
+        run: artifacts.Run; metrics get a row an epoch.
+        loss: loss(data, index, seed) returns the loss, averaged over valid steps, and their number.
+        save: called after each epoch with the lowest validation loss so far.
+        data, held_out: trajectories to train and to validate on.
+        sequences, epochs, lr, lr_end, grad_norm, validation: as in the stages' Config.
+    Returns:
+        True when trained to the end, False when the time limit stopped it.
+    """
+    optimizer = torch.optim.Adam(net.parameters(), lr=lr)
+    count, first, best = len(data[1]) - 1, 0, math.inf
+    if state := run.load_resume():
+        net.load_state_dict(state["net"]), optimizer.load_state_dict(state["optimizer"])
+        first, best = state["epoch"], state["best"]
+    updates = math.ceil(count / sequences)
+    bar = artifacts.bar(epochs * updates, run.dir.parent.name, initial=first * updates, unit="update")
+    for epoch in range(first, epochs):
+        rng = np.random.default_rng([seed, epoch])
+        torch.manual_seed(int(rng.integers(2**62)))
+        losses = []
+        for k, index in enumerate(trajectories.batches(count, sequences, rng)):
+            progress = (epoch + k / updates) / epochs
+            optimizer.param_groups[0]["lr"] = lr_end + (lr - lr_end) * (1 + math.cos(math.pi * progress)) / 2
+            value, _ = loss(data, index, (seed, epoch, k))
+            optimizer.zero_grad(set_to_none=True)
+            value.backward()
+            torch.nn.utils.clip_grad_norm_(net.parameters(), grad_norm)
+            optimizer.step()
+            losses.append(value.item())
+            bar.update()
+            bar.set_postfix_str(f"loss {losses[-1]:.3f}", refresh=False)
+        with torch.no_grad():  # the same noise and occlusions every epoch
+            batches = trajectories.batches(min(validation, len(held_out[1]) - 1), sequences)
+            values, steps = zip(*(loss(held_out, index, (k,)) for k, index in enumerate(batches)))
+        validation_loss = float(np.average([v.item() for v in values], weights=steps))
+        run.log(epoch=epoch + 1, train_loss=float(np.mean(losses)), validation_loss=validation_loss)
+        if validation_loss < best:
+            best = validation_loss
+            save()
+        run.save_resume(dict(epoch=epoch + 1, best=best, net=net.state_dict(), optimizer=optimizer.state_dict()))
+        if run.out_of_time() and epoch + 1 < epochs:
+            run.stop()
+            return False
+    return True

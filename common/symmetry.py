@@ -1,0 +1,36 @@
+"""The task's two mirror symmetries: a policy only ever sees the quarter of the workspace in which its episode began."""
+import gymnasium as gym
+import numpy as np
+
+from common.task import BINS
+
+# Reflecting x (or y) negates these entries of s = x, y, sin, cos, pusher x, y, force x, y; the box is its own mirror image.
+_FLIPS = np.array([[1, 0, 1, 0, 1, 0, 1, 0], [0, 1, 1, 0, 0, 1, 0, 1]], bool)
+
+
+def signs(first):
+    """(N, 2) of +-1 that carry the box of the first observations (N, >= 8) to x >= 0, y >= 0."""
+    return np.where(first[:, :2] < 0, -1, 1)
+
+
+def mirror(obs, sign):
+    """Observations (..., N, >= 8) reflected by signs (N, 2); what follows the first 8 entries stays."""
+    out = obs.copy()
+    out[..., :8] *= np.where(_FLIPS[0], sign[:, :1], 1) * np.where(_FLIPS[1], sign[:, 1:], 1)
+    return out
+
+
+class Mirrored(gym.vector.VectorWrapper):
+    """The topmost wrapper of a policy's stack: observations, final_obs and actions in the frame of `signs` of each episode."""
+
+    def reset(self, *, seed=None, options=None):
+        obs, infos = self.env.reset(seed=seed, options=options)
+        self.sign = signs(obs)
+        return mirror(obs, self.sign), infos
+
+    def step(self, action):
+        obs, *rest, infos = self.env.step(np.where(self.sign < 0, BINS - 1 - action, action))
+        if "final_obs" in infos:
+            infos["final_obs"] = mirror(infos["final_obs"], self.sign)
+            self.sign = np.where(infos["_final_obs"][:, None], signs(obs), self.sign)
+        return mirror(obs, self.sign), *rest, infos

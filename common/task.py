@@ -1,0 +1,85 @@
+"""The task in SI units: every constant of the paper's simulated pushing task, with its unit and its source.
+
+A state is the row (box x, box y, box theta, pusher x, pusher y, force x, force y) in m, m, rad, m, m, N, N. The frame lies
+at the centre of the workspace with x along its long side; the target is the pose (0, 0, 0).
+"""
+import numpy as np
+
+# Geometry (appendix A), m
+WORKSPACE = np.array([0.6, 0.3])
+HALF = WORKSPACE / 2
+BOX = np.array([0.12, 0.10, 0.07])
+RADIUS = 0.013  # the spherical pusher
+
+# Time (sec. 4)
+RATE = 15  # control frequency, Hz
+HORIZON = 300  # steps, 20 s
+
+# Actions (sec. 4): 11 bins a velocity, bin k is (k - 5) * 0.01 m/s
+BINS = 11
+MAX_SPEED = 0.05  # m/s, along each axis
+SPEEDS = np.linspace(-MAX_SPEED, MAX_SPEED, BINS)
+
+# Success and reward (sec. 4)
+TOLERANCE = np.array([0.01, np.deg2rad(15)])  # m, rad
+R_SUCCESS, R_OUT = 50.0, -10.0
+K_TRANS, K_ROT, K_SPEED = 0.1, 0.02, 0.004
+
+# Dynamics randomisation (appendix A, tab. dynamics_randomization): uniform in [low, high]
+MASS = (3.0, 3.5)  # kg
+MU_STATIC = (0.3, 0.5)
+MU_DYNAMIC = (0.1, 0.3)  # box on table; the pusher on the box is drawn from the same row
+RESTITUTION = (0.1, 0.7)
+GRAVITY = 9.81  # m/s^2
+LIMIT_SURFACE_C = 0.060  # m, friction torque / friction force of a box that stands on its four corners
+
+# Sensing (tab. occlusion_and_noise_params); the per-episode bias and the per-step noise share one standard deviation
+NOISE = np.array([0.0025, 0.0025, 0.05, 0.7, 0.7])  # box x, y (m), theta (rad), force x, y (N)
+OCCLUSION_START = 1 / 30  # probability at each visible step
+OCCLUSION_MEAN, OCCLUSION_STD = 10.0, 5.0  # s
+MAX_FORCE = 10.0  # N, clip of each axis (appendix B)
+
+# The study's starts: where the pusher can always get behind the box without leaving the workspace
+START_BOX = np.array([0.20, 0.059])  # m, half widths of the box centre's range
+START_GAP = 0.001  # m, least distance between pusher and box
+
+
+def wrap(angle):
+    """Angle in [-pi, pi), rad."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def scale(state):
+    """States (..., 7) to network inputs (..., 8): x, y, sin, cos, pusher x, y, force x, y, each in [-1, 1] (appendix B)."""
+    out = np.empty((*state.shape[:-1], 8), np.float32)
+    out[..., 0:2] = state[..., 0:2] / HALF
+    out[..., 2] = np.sin(state[..., 2])
+    out[..., 3] = np.cos(state[..., 2])
+    out[..., 4:6] = state[..., 3:5] / HALF
+    out[..., 6:8] = np.clip(state[..., 5:7], -MAX_FORCE, MAX_FORCE) / MAX_FORCE
+    return out
+
+
+def unscale_pose(q):
+    """Scaled poses (..., 4) = x, y, sin, cos to (..., 3) in m, m, rad."""
+    return np.concatenate([q[..., :2] * HALF, np.arctan2(q[..., 2], q[..., 3])[..., None]], -1)
+
+
+def reached(box, tolerance=1.0):
+    """Whether poses (..., 3) lie within `tolerance` times 1 cm and 15 degrees of the target (sec. 4)."""
+    return (np.linalg.norm(box[..., :2], axis=-1) <= tolerance * TOLERANCE[0]) & (
+        np.abs(wrap(box[..., 2])) <= tolerance * TOLERANCE[1])
+
+
+def outside(box, pusher):
+    """Whether the centre of box (..., 3) or pusher (..., 2) has left the workspace (appendix A)."""
+    return (np.abs(box[..., :2]) > HALF).any(-1) | (np.abs(pusher) > HALF).any(-1)
+
+
+def reward(box, velocity, success, out):
+    """r = r_term + k1 (1 - d_trans) + k2 (1 - d_rot) + k3 (1 - v_p) (sec. 4) for poses (N, 3) and pusher velocities (N, 2)."""
+    d_trans = np.linalg.norm(box[:, :2], axis=1) / np.linalg.norm(WORKSPACE)
+    d_rot = np.abs(wrap(box[:, 2])) / np.pi
+    v_p = np.linalg.norm(velocity, axis=1) / (MAX_SPEED * np.sqrt(2))
+    r_term = R_SUCCESS * success + R_OUT * (out & ~success)
+    return r_term + K_TRANS * (1 - d_trans) + K_ROT * (1 - d_rot) + K_SPEED * (1 - v_p)

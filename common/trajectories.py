@@ -1,0 +1,93 @@
+"""Stored trajectories of clean states: memory-mapped arrays, padded batches, and the errors of tab. estimator_ablation."""
+import numpy as np
+import torch
+
+from common import artifacts, task
+from common.observation import ObservationModel
+
+
+def load(states_path, offsets_path):
+    """Trajectories as (states (steps, 7) float32, memory-mapped; offsets (n + 1,)): the i-th is states[offsets[i]:offsets[i + 1]].
+
+    Raises:
+        artifacts.UserError: the two files do not belong together, or are damaged.
+    """
+    try:
+        states, offsets = np.load(states_path, mmap_mode="r"), np.load(offsets_path)
+        whole = states.shape == (offsets[-1], 7)
+    except (ValueError, OSError, IndexError):
+        whole = False
+    if not whole:
+        raise artifacts.UserError(f"{states_path} is damaged: rerun 02_collect.py with --force")
+    return states, offsets
+
+
+def files(name):
+    """File names of a set: train, validation, test, teacher_train or teacher_validation."""
+    return [f"{name}_states.npy", f"{name}_offsets.npy"]
+
+
+def load_set(cfg, name):
+    """A set of this preset's 02_collect, and the paths it was read from."""
+    paths = {file: artifacts.find(cfg, "02_collect", file) for file in files(name)}
+    return load(*paths.values()), paths
+
+
+def padded(data, index):
+    """Trajectories `index` as states (T, B, 7) and mask (T, B); the last state is repeated behind a trajectory's end."""
+    states, offsets = data
+    start, length = offsets[index], offsets[index + 1] - offsets[index]
+    t = np.arange(length.max())[:, None]
+    return states[start + np.minimum(t, length - 1)], (t < length).astype(np.float32)
+
+
+def batches(count, size, rng=None):
+    """Index arrays of `size` trajectories out of `count`, shuffled by `rng`, in order without."""
+    order = rng.permutation(count) if rng else np.arange(count)
+    return [order[i:i + size] for i in range(0, count, size)]
+
+
+def observe(data, index, seed, device, occlusion=None):
+    """Batch with fresh noise and occlusions: o (T, B, 9), scaled true states (T, B, 8), mask (T, B), on the device."""
+    states, mask = padded(data, index)
+    o = ObservationModel(len(index), seed, occlusion).trajectory(states)
+    return tuple(torch.as_tensor(x, device=device) for x in (o, task.scale(states), mask))
+
+
+def pose_errors(q_hat, q, occluded, mask):
+    """Errors of scaled poses (T, B, 4), pooled over the valid steps (tab. estimator_ablation).
+
+    Args:
+        q_hat, q: estimated and true poses; occluded, mask: (T, B).
+    Returns:
+        {"all" | "seen" | "occluded": sums over steps of (1, |d_xy|, |d_xy|^2, |d_theta|, d_theta^2) in m and rad}, to add up
+        over batches before `error_table`.
+    """
+    q_hat, q = (task.unscale_pose(x.double().cpu().numpy()) for x in (q_hat, q))
+    occluded, mask = occluded.cpu().numpy() > 0, mask.cpu().numpy() > 0
+    l2 = np.linalg.norm(q_hat[..., :2] - q[..., :2], axis=-1)
+    angle = np.abs(task.wrap(q_hat[..., 2] - q[..., 2]))
+    terms = np.stack([np.ones_like(l2), l2, l2**2, angle, angle**2])
+    return {name: terms[:, chosen].sum(1) for name, chosen in
+            {"all": mask, "seen": mask & ~occluded, "occluded": mask & occluded}.items()}
+
+
+def error_table(sums):
+    """Sums of `pose_errors` as the table's numbers: mean L2 and per-axis RMSE in mm, mean abs. and RMSE in degrees."""
+    def row(s):
+        l2, l2_2, angle, angle_2 = s[1:] / max(s[0], 1)
+        return {"trans_mean_l2_mm": 1e3 * l2, "trans_rmse_mm": 1e3 * np.sqrt(l2_2 / 2),
+                "rot_mean_abs_deg": np.rad2deg(angle), "rot_rmse_deg": np.rad2deg(np.sqrt(angle_2))}
+
+    return row(sums["all"]) | {name: row(sums[name]) for name in ("seen", "occluded")}
+
+
+@torch.no_grad()
+def measure(data, count, size, seed, device, predict, occlusion=None):
+    """Error table of predict(o) -> scaled poses (T, B, 4) over the first `count` trajectories, the same noise for every predict."""
+    total = {}
+    for k, index in enumerate(batches(min(count, len(data[1]) - 1), size)):
+        o, s, mask = observe(data, index, (seed, k), device, occlusion)
+        for name, sums in pose_errors(predict(o), s[..., :4], o[..., 8], mask).items():
+            total[name] = total.get(name, 0) + sums
+    return error_table(total)
