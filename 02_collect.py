@@ -68,7 +68,7 @@ def join(run, name, parts):
     offsets = np.concatenate([[0], lengths.cumsum()])
 
     def write(path):
-        states = np.lib.format.open_memmap(path, "w+", np.float32, (offsets[-1], 7))
+        states = np.lib.format.open_memmap(path, "w+", np.float32, (int(offsets[-1]), 7))
         end = 0
         for part in parts:
             chunk = np.load(part)["states"]
@@ -83,7 +83,8 @@ def join(run, name, parts):
 
 def main(cfg):
     folder = artifacts.find(cfg, "01_train_privileged", "policy.safetensors").parent
-    paths = [artifacts.find(cfg, "01_train_privileged", p.name) for p in sorted(folder.glob("checkpoint_*"))]
+    names = [name for name in artifacts.record_of(cfg, folder)["outputs"] if name.startswith("checkpoint_")]
+    paths = [artifacts.find(cfg, "01_train_privileged", name) for name in sorted(names)]
     run = artifacts.Run(cfg, "02_collect", {p.name: p for p in paths})
     if run.skip():
         return

@@ -118,7 +118,7 @@ def save_tensors(path: Path, tensors: dict[str, torch.Tensor] | torch.nn.Module,
     """Writes a safetensors file; meta is anything that JSON holds."""
     tensors = tensors.state_dict() if isinstance(tensors, torch.nn.Module) else tensors
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    data = safetensors.torch.save(tensors, {key: json.dumps(value) for key, value in meta.items()})
+    data = safetensors.torch.save(tensors, {"meta": json.dumps(meta)})  # one key: safetensors shuffles several
     write_atomic(path, lambda temporary: temporary.write_bytes(data))
 
 
@@ -126,7 +126,7 @@ def load_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict]:
     """The tensors, on the CPU, and the meta of save_tensors."""
     try:
         with safetensors.safe_open(path, framework="pt") as file:
-            meta = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
+            meta = json.loads((file.metadata() or {}).get("meta", "{}"))
             return {name: file.get_tensor(name) for name in file.keys()}, meta
     except (safetensors.SafetensorError, OSError, ValueError):
         raise UserError(f"{path} is missing or damaged: rerun its stage with --force") from None

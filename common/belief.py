@@ -11,6 +11,7 @@ class Believed(gym.vector.VectorWrapper):
 
     s_hat is (q_hat, pusher, noisy force) without xi; sigma the four standard deviations sqrt(diag Sigma) in scaled units,
     clipped to [0, 1] (appendix B.1). The estimator keeps a hidden state per world and forgets it at episode ends.
+    Infos: `belief` (N, 12), s_hat and sigma of this step; where an episode ended, of its end.
 
     Args:
         env: an Observed env.
@@ -21,40 +22,36 @@ class Believed(gym.vector.VectorWrapper):
 
     def __init__(self, env, estimator, passes, sigma):
         super().__init__(env)
-        self.estimator, self.passes, self.sigma = estimator, passes, sigma
+        self.estimator, self.passes, self.size = estimator, passes, 12 if sigma else 8
         self.device = next(estimator.parameters()).device
-        size = 12 if sigma else 8
-        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (self.size,), np.float32)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, env.num_envs)
         self.hidden = None
 
     def reset(self, *, seed=None, options=None):
         o, infos = self.env.reset(seed=seed, options=options)
-        s_hat, self.hidden = self._believe(o, None)
-        return s_hat, infos
+        belief, self.hidden = self._believe(o, None)
+        return belief[:, :self.size], infos | {"belief": belief}
 
     def step(self, action):
         o, reward, terminated, truncated, infos = self.env.step(action)
         if "final_obs" not in infos:
-            s_hat, self.hidden = self._believe(o, self.hidden)
-            return s_hat, reward, terminated, truncated, infos
+            infos["belief"], self.hidden = self._believe(o, self.hidden)
+            return infos["belief"][:, :self.size], reward, terminated, truncated, infos
         final, self.hidden = self._believe(infos["final_obs"], self.hidden)  # elsewhere final_obs is the observation
-        infos["final_obs"] = final
+        infos |= {"final_obs": final[:, :self.size], "belief": final}
         worlds = np.flatnonzero(infos["_final_obs"])
         first, hidden = self._believe(o[worlds], None)
-        s_hat = final.copy()
-        s_hat[worlds] = first
+        belief = final.copy()
+        belief[worlds] = first
         for all_worlds, new in zip(self.hidden, hidden):
             all_worlds[:, worlds] = new.to(all_worlds.dtype)
-        return s_hat, reward, terminated, truncated, infos
+        return belief[:, :self.size], reward, terminated, truncated, infos
 
     @torch.no_grad()
     def _believe(self, o, hidden):
         x = torch.as_tensor(o, device=self.device)[None]
         with autocast(self.device):
             q, variance, hidden = self.estimator.predict(x, hidden, self.passes)
-        s_hat = o[:, :8].copy()
-        s_hat[:, :4] = q[0].cpu().numpy()
-        if self.sigma:
-            s_hat = np.concatenate([s_hat, variance[0].sqrt().clamp(max=1.0).cpu().numpy()], 1)
-        return s_hat, hidden
+        sigma = variance[0].sqrt().clamp(max=1.0)
+        return np.concatenate([q[0].cpu().numpy(), o[:, 4:8], sigma.cpu().numpy()], 1), hidden

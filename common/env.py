@@ -1,4 +1,7 @@
-"""Planar pushing: many worlds in one pymunk Space (PushVectorEnv), and one world for everybody else (PushEnv)."""
+"""Planar pushing: many worlds in one pymunk Space (PushVectorEnv), and one world for everybody else (PushEnv).
+
+Importing this module registers both as "Push-v0"; gymnasium.make("common.env:Push-v0") imports it by itself.
+"""
 from collections import deque
 
 import gymnasium as gym
@@ -6,18 +9,26 @@ import numpy as np
 import pymunk
 from gymnasium.vector import AutoresetMode
 from pymunk import batch
-from pymunk._chipmunk_cffi import lib  # a joint's max_force, without the property's overhead
+from pymunk._chipmunk_cffi import lib  # Chipmunk's setters, without the overhead of pymunk's properties
 
 from common import geometry, task
 
 SUB_STEPS = 6  # a control step; tests/test_env.py holds the physics that this number must meet
-ITERATIONS = 10
-SPACING = 2.0  # m between worlds, so that they never meet
-REST = 1e-3  # m/s: a slower box feels static friction
+ITERATIONS = 5
+SPACING = 10.0  # m between worlds, so that they never meet
+REST = 1e-4  # m/s: a slower box is at rest
+GYRATION = float(task.BOX[:2] @ task.BOX[:2]) / 12  # m^2, moment of inertia / mass
+_SLOWING = np.array([1.0, task.LIMIT_SURFACE_C**2 / GYRATION])  # the share that friction takes of v and of omega
 _MOTION = batch.BodyFields.POSITION | batch.BodyFields.ANGLE | batch.BodyFields.VELOCITY | batch.BodyFields.ANGULAR_VELOCITY
-_CONTACT = batch.ArbiterFields.BODY_A_ID | batch.ArbiterFields.BODY_B_ID | batch.ArbiterFields.TOTAL_IMPULSE
+_KICK = batch.BodyFields.VELOCITY | batch.BodyFields.ANGULAR_VELOCITY | batch.BodyFields.FORCE | batch.BodyFields.TORQUE
+_CONTACT = batch.ArbiterFields.TOTAL_IMPULSE | batch.ArbiterFields.POINT_A_1
 _DRAWS = {"mass": task.MASS, "mu_static": task.MU_STATIC, "mu_dynamic": task.MU_DYNAMIC, "mu_pusher": task.MU_DYNAMIC,
           "restitution": task.RESTITUTION}
+
+
+def _set_all(setter, handles, values):
+    """Calls a setter of Chipmunk's for every pair, at the speed of C."""
+    deque(map(setter, handles, values.tolist()), maxlen=0)
 
 
 class PushVectorEnv(gym.vector.VectorEnv):
@@ -27,8 +38,8 @@ class PushVectorEnv(gym.vector.VectorEnv):
     Observation: (N, 8) float32, the true state scaled as in appendix B (task.scale).
     Reward: sec. 4 (task.reward). Termination: success (looked at first) or the centre of box or pusher outside
     the workspace. Truncation: after 300 steps.
-    Infos: `state` (N, 7) true states in SI units and `success` (N,) of this step; where an episode ended, `_final_obs` (N,)
-    is set, `final_obs` (N, 8) and `final_state` (N, 7) hold its end, and observation and `state` are the next episode's first.
+    Infos: `state` (N, 7) true states in SI units and `success` (N,) of this step. Where an episode ended, `_final_obs` (N,)
+    is set, `final_obs` (N, 8) and `final_state` (N, 7) hold its end, and observation and `state` start the next episode.
 
     Args:
         num_envs: number of worlds.
@@ -46,7 +57,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
 
     def __init__(self, num_envs=1, *, whole_workspace=False, sub_steps=SUB_STEPS):
         self.num_envs = num_envs
-        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (8,), np.float32)
+        self.single_observation_space = gym.spaces.Box(-2.0, 2.0, (8,), np.float32)  # positions leave [-1, 1] at the end
         self.single_action_space = gym.spaces.MultiDiscrete([task.BINS, task.BINS])
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
@@ -56,146 +67,175 @@ class PushVectorEnv(gym.vector.VectorEnv):
         self.box, self.pusher, self.force = np.zeros((num_envs, 3)), np.zeros((num_envs, 2)), np.zeros((num_envs, 2))
         self.dynamics = {name: np.zeros(num_envs) for name in _DRAWS}
         self._steps = np.zeros(num_envs, int)
+        self._static, self._dynamic = np.zeros(num_envs), np.zeros(num_envs)  # m/s, what friction can take of a speed in dt
+        self._inertia = np.ones((num_envs, 2))  # mass in kg, moment in kg m^2
+        self._rest, self._touched, self._held = np.zeros((3, num_envs), bool)  # at rest; pushed in the last sub-step, step
         self._build()
 
     def _build(self):
-        """One Space: all boxes, then all pushers, then the static body, which is the order of pymunk.batch's arrays."""
+        """One Space with all boxes, then all pushers, which is the order of pymunk.batch's arrays."""
         n = self.num_envs
-        side = int(np.ceil(np.sqrt(n)))
-        index = np.arange(n)
-        self._origin = SPACING * np.stack([index % side, index // side], 1).astype(float)
+        self._side = int(np.ceil(np.sqrt(n)))
+        self._origin = SPACING * np.stack(np.divmod(np.arange(n), self._side), 1)
         self.space = pymunk.Space()
         self.space.iterations = ITERATIONS
         self.space.collision_slop = 1e-4
         self.space.collision_bias = 1e-6
+        self.space.collision_persistence = 1  # a contact that has ended would still report its last impulse
         self._boxes = [pymunk.Body(1.0, 1.0) for _ in range(n)]
         pushers = [pymunk.Body(body_type=pymunk.Body.KINEMATIC) for _ in range(n)]
         self._shapes = [pymunk.Poly.create_box(b, tuple(task.BOX[:2])) for b in self._boxes]
         balls = [pymunk.Circle(p, task.RADIUS) for p in pushers]
         for ball in balls:
             ball.friction = ball.elasticity = 1.0  # Chipmunk multiplies the pair's values: the box carries the drawn ones
-        static = self.space.static_body
-        pivots = [pymunk.PivotJoint(static, b, tuple(o), (0.0, 0.0)) for b, o in zip(self._boxes, self._origin)]
-        gears = [pymunk.GearJoint(static, b, 0.0, 1.0) for b in self._boxes]
-        for joint in pivots + gears:
-            joint.max_bias = 0.0  # the joints resist motion, they do not pull back
-        for i in range(n):  # so far apart that no broad phase sees neighbours
-            self._boxes[i].position = pushers[i].position = tuple(self._origin[i])
+        for box, pusher, origin in zip(self._boxes, pushers, self._origin.tolist()):
+            box.position = pusher.position = origin  # so far apart that no broad phase sees neighbours
         self.space.add(*self._boxes, *self._shapes)
         self.space.add(*pushers, *balls)
-        self.space.add(*pivots, *gears)
-        self._joints = np.array([j._constraint for j in pivots + gears], object).reshape(2, n)
-        self._bodies, self._contacts = batch.Buffer(), batch.Buffer()
-        batch.get_space_bodies(self.space, batch.BodyFields.BODY_ID, self._bodies)
-        ids = np.frombuffer(self._bodies.int_buf(), np.uintp)[:2 * n].astype(np.int64)
-        self._bodies.clear()
-        self._id_order = np.argsort(ids)
-        self._sorted_ids = ids[self._id_order]
-        self._motion = np.zeros((2 * n + 1, 6))  # x, y, theta, v_x, v_y, omega of boxes, pushers, static body
-        self._writer = batch.Buffer()
+        self._c_boxes = np.array([b._body for b in self._boxes], object)
+        self._c_shapes = np.array([s._shape for s in self._shapes], object)
+        self._motion = np.zeros((2 * n, 6))  # x, y, theta, v_x, v_y, omega of boxes, then pushers
+        self._kick = np.zeros((2 * n, 6))  # v_x, v_y, omega, f_x, f_y, tau
+        self._bodies, self._contacts, self._writer = batch.Buffer(), batch.Buffer(), batch.Buffer()
 
     def _read(self):
         self._bodies.clear()
         batch.get_space_bodies(self.space, _MOTION, self._bodies)
         return np.frombuffer(self._bodies.float_buf()).reshape(-1, 6)
 
-    def _write(self):
-        self._writer.set_float_buf(self._motion)
-        batch.set_space_bodies(self.space, _MOTION, self._writer)
+    def _write(self, values, fields):
+        self._writer.set_float_buf(values)
+        batch.set_space_bodies(self.space, fields, self._writer)
 
-    def _set_friction(self, motion, moving):
-        """Ellipsoidal limit surface: f = mu m g v / n and tau = mu m g c (c omega) / n, n = sqrt(v^2 + (c omega)^2).
+    def _apply_friction(self, twist, change):
+        """Table friction of the coming sub-step on boxes with velocities (N, 3): the ellipsoidal limit surface
 
-        At rest both joints hold with their full static value. Only boxes that move, or have just stopped, are touched.
+            f = -mu m g v / n,  tau = -mu m g c^2 omega / n,  n = sqrt(v^2 + (c omega)^2).
+
+        Chipmunk gets it as velocities, forces and masses. A box that slides freely moves with its mean velocity of the
+        sub-step. A pushed one would stick and slip where friction can stop it within dt, so for it the law is linearly
+        implicit: mass and moment grow by -dt f / v and -dt tau / omega. Its n is the last one plus `change` (N,), the
+        pusher's change of velocity in m/s, which bounds that of n. A box at rest meets the pusher with the growth of
+        mu_static at MAX_SPEED, and anything else with its static limit surface.
         """
-        speed = np.hypot(motion[:, 3], motion[:, 4])
-        turn = np.abs(motion[:, 5]) * task.LIMIT_SURFACE_C
-        n = np.sqrt(speed**2 + turn**2)
-        now = n > REST
-        touched = np.flatnonzero(now | moving)
-        if touched.size:
-            now_t, n_t = now[touched], np.maximum(n[touched], REST)
-            load = np.where(now_t, self._load_dynamic[touched] / n_t, self._load_static[touched])
-            limits = np.stack([load * np.where(now_t, speed[touched], 1.0),
-                               load * np.where(now_t, turn[touched], 1.0) * task.LIMIT_SURFACE_C])
-            deque(map(lib.cpConstraintSetMaxForce, self._joints[:, touched].ravel(), limits.ravel().tolist()), maxlen=0)
-        return now
+        n = np.linalg.norm(twist * [1.0, 1.0, task.LIMIT_SURFACE_C], axis=1)
+        slides = n > REST
+        w = np.flatnonzero(slides & self._rest & ~self._touched)
+        f_tau = twist[w] * [1.0, 1.0, GYRATION / task.LIMIT_SURFACE_C]  # that would set these in motion, times dt / m
+        slides[w] = np.linalg.norm(f_tau, axis=1) > self._static[w]
+        self._kick[:self.num_envs] = 0.0
+        w = np.flatnonzero(slides | ~self._rest)
+        if w.size:
+            pushed = (slides & self._touched)[w, None]
+            rate = (self._dynamic[w] / np.maximum(n[w] + pushed[:, 0] * change[w], REST))[:, None] * _SLOWING
+            loss = np.minimum(rate, 1.0)
+            left = np.where(pushed, 1.0 / (1.0 + rate), 1.0 - loss)
+            mean = np.where(pushed, 1.0, 1.0 - loss + loss / np.maximum(rate, 1.0) / 2)
+            self._rest[w] = rest = ~slides[w] | (left == 0.0).all(1)
+            growth = np.where(rest[:, None], self._static[w, None] / task.MAX_SPEED * _SLOWING, pushed * rate)
+            inertia = self._inertia[w] * (1.0 + growth)
+            self._kick[w, :3] = twist[w] * mean[:, [0, 0, 1]]
+            self._kick[w, 3:] = twist[w] * (inertia * (left - mean) / self._dt)[:, [0, 0, 1]]
+            _set_all(lib.cpBodySetMass, self._c_boxes[w], inertia[:, 0])
+            _set_all(lib.cpBodySetMoment, self._c_boxes[w], inertia[:, 1])
 
     def _add_impulses(self, impulse):
         """Adds the last sub-step's contact impulses on the pushers to (N, 2)."""
         self._contacts.clear()
         batch.get_space_arbiters(self.space, _CONTACT, self._contacts)
-        ids = np.frombuffer(self._contacts.int_buf(), np.uintp).reshape(-1, 2).astype(np.int64)
-        if len(ids):
-            j = np.frombuffer(self._contacts.float_buf()).reshape(-1, 2)
-            a, b = self._id_order[np.searchsorted(self._sorted_ids, ids)].T
-            pusher_is_b = b >= self.num_envs
-            impulse[np.where(pusher_is_b, b, a) - self.num_envs] += np.where(pusher_is_b, 1.0, -1.0)[:, None] * j
+        j, point = np.split(np.frombuffer(self._contacts.float_buf()).reshape(-1, 4), 2, 1)
+        column, row = np.rint(point / SPACING).astype(int).T  # where it happened tells the world
+        world = column * self._side + row
+        impulse[world] += j  # on the first body of a contact, the pusher: Chipmunk puts circles before polygons
+        self._touched[:] = False
+        self._touched[world] = j.any(1)
 
     def _simulate(self, velocity):
         """Moves the pushers with `velocity` (N, 2) in m/s for one control step."""
         n = self.num_envs
-        self._motion[:n] = self._read()[:n]
-        self._motion[n:2 * n, 3:5] = velocity
-        self._motion[n:2 * n, 0:2] = self.pusher + self._origin
-        self._write()
+        held = self.force.any(1)  # only a new touch bounces: the sub-steps do not resolve the smaller bounces that follow
+        new = np.flatnonzero(held != self._held)
+        _set_all(lib.cpShapeSetElasticity, self._c_shapes[new], np.where(held, 0.0, self.dynamics["restitution"])[new])
+        self._held = held
+        motion = self._read()
+        change = np.linalg.norm(velocity - motion[n:, 3:5], axis=1)
+        self._kick[n:, :2] = velocity
         impulse = np.zeros((n, 2))
-        motion = self._motion[:n]
-        for _ in range(self._sub_steps):
-            self._moving = self._set_friction(motion, self._moving)
+        for k in range(self._sub_steps):
+            self._apply_friction(motion[:n, 3:], change if k == 0 else np.zeros(n))
+            self._write(self._kick, _KICK)
             self.space.step(self._dt)
             self._add_impulses(impulse)
-            motion = self._read()[:n]
-        self.box = motion[:, :3].copy()
+            motion = self._read()
+        self.box = motion[:n, :3].copy()
         self.box[:, :2] -= self._origin
-        self.pusher = self.pusher + velocity / task.RATE
+        self.pusher = motion[n:, :2] - self._origin
         self.force = impulse * task.RATE
 
     def place(self, worlds, box, pusher, dynamics):
-        """Sets `worlds` (k,) to rest at poses (k, 3) and (k, 2) with given dynamics ({name: (k,)}); force and clock to zero."""
+        """Starts `worlds` (k,) anew at poses (k, 3) and (k, 2), at rest, with given dynamics ({name: (k,)})."""
         for name, value in dynamics.items():
             self.dynamics[name][worlds] = value
         d = {name: value[worlds] for name, value in self.dynamics.items()}
-        for i, mass, mu, e in zip(worlds, d["mass"].tolist(), d["mu_pusher"].tolist(), d["restitution"].tolist()):
-            self._boxes[i].mass = mass
-            self._boxes[i].moment = mass * float(task.BOX[:2] @ task.BOX[:2]) / 12
-            self._shapes[i].friction, self._shapes[i].elasticity = mu, e
-        self._load_static[worlds] = d["mu_static"] * d["mass"] * task.GRAVITY
-        self._load_dynamic[worlds] = d["mu_dynamic"] * d["mass"] * task.GRAVITY
-        self._moving[worlds] = True  # so that the next sub-step sets the new limits
+        self._inertia[worlds] = d["mass"][:, None] * [1.0, GYRATION]
+        self._static[worlds] = d["mu_static"] * task.GRAVITY * self._dt
+        self._dynamic[worlds] = d["mu_dynamic"] * task.GRAVITY * self._dt
+        _set_all(lib.cpShapeSetFriction, self._c_shapes[worlds], d["mu_pusher"])
+        _set_all(lib.cpShapeSetElasticity, self._c_shapes[worlds], d["restitution"])
+        self._rest[worlds] = False  # so that the next sub-step sets the new mass
         self.box[worlds], self.pusher[worlds], self.force[worlds], self._steps[worlds] = box, pusher, 0.0, 0
-        n = self.num_envs
+        for i in worlds:  # Chipmunk keeps a contact's impulses and position correction: nothing of the last episode stays
+            lib.cpSpaceRemoveShape(self.space._space, self._c_shapes[i])
+            lib.cpSpaceAddShape(self.space._space, self._c_shapes[i])
+            lib.cpBodyUpdatePosition(self._c_boxes[i], 0.0)
         self._motion[:] = self._read()
-        self._motion[worlds] = 0.0
-        self._motion[worlds, :2] = box[:, :2] + self._origin[worlds]
-        self._motion[worlds, 2] = box[:, 2]
-        self._motion[n + worlds] = 0.0
-        self._motion[n + worlds, :2] = pusher + self._origin[worlds]
-        self._write()
+        for rows, pose in (worlds, box), (self.num_envs + worlds, pusher):
+            self._motion[rows] = 0.0
+            self._motion[rows, :pose.shape[1]] = pose
+            self._motion[rows, :2] += self._origin[worlds]
+        self._write(self._motion, _MOTION)
 
-    def _draw_start(self, count):
-        """Starts of the study; the aided ones put the box nearer to the target and the pusher within 3 cm of it."""
+    def _draw_start(self, count, box=None, pusher=None):
+        """Starts of the study around what is given; the aided ones: box nearer to the target, pusher within 3 cm of it."""
         rng = self.np_random
-        box = rng.uniform(-1, 1, (count, 3)) * [*self._start_box, np.pi]
-        near = rng.random(count) < self.near_share
-        box[near] *= rng.random((near.sum(), 1))
-        pusher = np.empty((count, 2))
-        for i in range(count):
-            while True:
-                pusher[i] = rng.uniform(-1, 1, 2) * task.HALF
-                if task.START_GAP <= geometry.nearest(box[i], pusher[i])[0] <= (0.03 if near[i] else np.inf):
-                    break
-        return box, pusher
 
-    def _start(self, worlds, given=None):
-        box, pusher = self._draw_start(len(worlds))
-        dynamics = {name: self.np_random.uniform(*limits, len(worlds)) for name, limits in _DRAWS.items()}
-        given = {name: np.asarray(value, float) for name, value in (given or {}).items()}
-        if unknown := given.keys() - dynamics.keys() - {"box", "pusher"}:
-            raise ValueError(f"unknown reset options {sorted(unknown)}; known: box, pusher, {', '.join(_DRAWS)}")
-        box = np.broadcast_to(given.pop("box", box), box.shape)
-        pusher = np.broadcast_to(given.pop("pusher", pusher), pusher.shape)
-        self.place(worlds, box, pusher, dynamics | {k: np.broadcast_to(v, len(worlds)) for k, v in given.items()})
+        def draw_box(k):
+            return rng.uniform(-1, 1, (k, 3)) * [*self._start_box, np.pi]
+
+        def draw_pusher(k):
+            return rng.uniform(-1, 1, (k, 2)) * task.HALF
+
+        near = rng.random(count) < self.near_share
+        boxes = draw_box(count) * np.where(near, rng.random(count), 1.0)[:, None] if box is None else box
+        pushers = draw_pusher(count) if pusher is None else pusher
+        farthest = np.where(near & (pusher is None), 0.03, np.inf)
+        for i in range(count if box is None or pusher is None else 0):
+            while not task.START_GAP <= geometry.nearest(boxes[i], pushers[i])[0] <= farthest[i]:
+                if pusher is None:
+                    pushers[i] = draw_pusher(1)
+                else:
+                    boxes[i] = draw_box(1)
+        return boxes, pushers
+
+    def _start(self, worlds, **given):
+        box, pusher = self._draw_start(len(worlds), given.pop("box", None), given.pop("pusher", None))
+        drawn = {name: self.np_random.uniform(*limits, len(worlds)) for name, limits in _DRAWS.items()}
+        self.place(worlds, box, pusher, drawn | given)
+
+    def _given(self, options):
+        """Reset options as arrays (N, ...), checked: Chipmunk would end the process at a negative coefficient."""
+        given = {}
+        for name, value in (options or {}).items():
+            if name not in ("box", "pusher", *_DRAWS):
+                raise ValueError(f"unknown reset option {name!r}; known: box, pusher, {', '.join(_DRAWS)}")
+            one = {"box": (3,), "pusher": (2,)}.get(name, ())
+            value = np.asarray(value, float)
+            if value.shape not in (one, (self.num_envs, *one)):
+                raise ValueError(f"reset option {name!r} has shape {value.shape}, not {(self.num_envs, *one)} or {one}")
+            if not np.isfinite(value).all() or name in _DRAWS and value.min() < 0 or name == "mass" and value.min() == 0:
+                raise ValueError(f"reset option {name!r} is {value}: not finite, or out of its physical range")
+            given[name] = np.array(np.broadcast_to(value, (self.num_envs, *one)))
+        return given
 
     @property
     def state(self):
@@ -206,12 +246,10 @@ class PushVectorEnv(gym.vector.VectorEnv):
         """Starts every world anew; `options` gives any of box (N, 3), pusher (N, 2) and the dynamics (N,), or one for all.
 
         Raises:
-            ValueError: an unknown option, or one of a wrong shape.
+            ValueError: an unknown option, or one of a wrong shape or value.
         """
         super().reset(seed=seed)
-        self._load_static, self._load_dynamic = np.zeros(self.num_envs), np.zeros(self.num_envs)
-        self._moving = np.zeros(self.num_envs, bool)
-        self._start(np.arange(self.num_envs), options)
+        self._start(np.arange(self.num_envs), **self._given(options))
         state = self.state
         return task.scale(state), {"state": state}
 
@@ -224,7 +262,8 @@ class PushVectorEnv(gym.vector.VectorEnv):
         success = task.reached(self.box, self.tolerance)
         out = task.outside(self.box, self.pusher)
         terminated = success | out
-        return task.reward(self.box, velocity, success, out), terminated, ~terminated & (self._steps >= task.HORIZON), success
+        truncated = ~terminated & (self._steps >= task.HORIZON)
+        return task.reward(self.box, velocity, success, out), terminated, truncated, success
 
     def step(self, action):
         reward, terminated, truncated, success = self.advance(action)
@@ -276,7 +315,7 @@ class PushEnv(gym.Env):
 
 def draw(state, width=800):
     """Top view (width / 2, width, 3) uint8 of a state (7,): target light blue, box dark blue, pusher red (fig. sim)."""
-    import cv2
+    import cv2  # only pictures need it
     image = np.full((width // 2, width, 3), 255, np.uint8)
 
     def pixels(points):  # m to 1/16 pixel
@@ -288,7 +327,8 @@ def draw(state, width=800):
         local = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * task.BOX[:2] / 2
         return local @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
 
-    cv2.polylines(image, [pixels(np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * task.HALF)], True, (150, 150, 150), 2, cv2.LINE_AA, 4)
+    frame = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * task.HALF
+    cv2.polylines(image, [pixels(frame)], True, (150, 150, 150), 2, cv2.LINE_AA, 4)
     cv2.fillPoly(image, [pixels(corners(np.zeros(3)))], (170, 205, 240), cv2.LINE_AA, 4)
     cv2.fillPoly(image, [pixels(corners(state[:3]))], (30, 60, 130), cv2.LINE_AA, 4)
     front = state[:2] + np.array([np.cos(state[2]), np.sin(state[2])]) * task.BOX[0] / 2
@@ -298,4 +338,4 @@ def draw(state, width=800):
     return image
 
 
-gym.register("Push-v0", entry_point=PushEnv, vector_entry_point=PushVectorEnv)
+gym.register("Push-v0", entry_point="common.env:PushEnv", vector_entry_point="common.env:PushVectorEnv")

@@ -31,6 +31,12 @@ class Recurrent(nn.Module):
         self.encoder = nn.Linear(inputs, sizes[0])
         self.lstm = nn.LSTM(sizes[0], sizes[1]) if memory else nn.Linear(sizes[0], sizes[1])
         self.head = nn.Sequential(nn.Linear(sizes[1], sizes[2]), nn.Tanh(), nn.Linear(sizes[2], outputs))
+        for name, weight in self.named_parameters():  # larger features than torch's default: learning starts sooner
+            if weight.ndim == 1:
+                nn.init.zeros_(weight)
+            else:
+                for gate in weight.chunk(4) if "lstm" in name and memory else [weight]:
+                    nn.init.orthogonal_(gate, 1.0 if "weight_hh" in name else 2**0.5)
 
     def forward(self, x, hidden=None):
         """Outputs (T, B, outputs) float32 and the next hidden state of inputs (T, B, inputs); no hidden state is zeros."""
@@ -48,9 +54,7 @@ class Recurrent(nn.Module):
 def policy(inputs, sizes=(128, 256, 128), memory=True):
     """Net with 22 logits: 11 velocities along x, 11 along y. Starts near the uniform distribution."""
     net = Recurrent(inputs, 2 * BINS, sizes, memory)
-    with torch.no_grad():
-        net.head[-1].weight *= 0.01
-        net.head[-1].bias.zero_()
+    nn.init.orthogonal_(net.head[-1].weight, 0.01)
     return net
 
 
@@ -84,6 +88,15 @@ def forget(hidden, worlds):
     return tuple(h * (~worlds)[None, :, None] for h in hidden)
 
 
+def dropout(x, p):
+    """F.dropout with 16 random bits an element: four times as fast on a CPU, where the masks cost more than the layers."""
+    if p == 0:
+        return x
+    bits = torch.empty((x.numel() + 3) // 4, dtype=torch.int64, device=x.device).random_(-2**63, None)
+    keep = bits.view(torch.int16)[:x.numel()].view(x.shape) >= round(p * 2**16) - 2**15
+    return x * (keep / (1 - p)).to(x.dtype)
+
+
 class Estimator(nn.Module):
     """f: LSTM 1024, then linear 512, 256, 8 with tanh and dropout before every linear layer (sec. 4).
 
@@ -103,7 +116,7 @@ class Estimator(nn.Module):
     def head(self, z):
         """Poses (..., 4) and log-variances (..., 4) or None of features (..., H), with a fresh dropout mask each call."""
         for i, layer in enumerate(self.layers):
-            z = layer(F.dropout(z, self.dropout) if self.dropout else z)  # at training and testing time
+            z = layer(dropout(z, self.dropout))  # at training and testing time
             if i < 2:
                 z = torch.tanh(z)
         q, log_var = z.float().split(4, -1) if self.likelihood else (z.float(), None)

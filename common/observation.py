@@ -76,7 +76,10 @@ def _assemble(noisy, occluded):
 
 
 class Observed(gym.vector.VectorWrapper):
-    """A PushVectorEnv seen through an ObservationModel: observations (N, 9), final_obs included."""
+    """A PushVectorEnv seen through an ObservationModel: observations (N, 9), final_obs included.
+
+    Infos: `o` (N, 9), the observation of this step; where an episode ended, of its end.
+    """
 
     def __init__(self, env, occlusion=None):
         super().__init__(env)
@@ -88,11 +91,12 @@ class Observed(gym.vector.VectorWrapper):
         _, infos = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self.model.seed(seed)
-        return self.model.reset(np.arange(self.num_envs), infos["state"]), infos
+        o = self.model.reset(np.arange(self.num_envs), infos["state"])
+        return o, infos | {"o": o}
 
     def step(self, action):
         _, reward, terminated, truncated, infos = self.env.step(action)
-        obs = self.model.step(infos.get("final_state", infos["state"]))
+        obs = infos["o"] = self.model.step(infos.get("final_state", infos["state"]))
         if "final_obs" in infos:  # the ended episode's bias and occlusion see its last state; only then are they cleared
             infos["final_obs"] = obs
             ended = np.flatnonzero(infos["_final_obs"])

@@ -30,7 +30,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
         rng = np.random.default_rng([seed, epoch])
         torch.manual_seed(int(rng.integers(2**62)))
         losses = []
-        for k, index in enumerate(trajectories.batches(count, sequences, rng)):
+        for k, index in enumerate(trajectories.batches(rng.permutation(count), sequences)):
             progress = (epoch + k / updates) / epochs
             optimizer.param_groups[0]["lr"] = lr_end + (lr - lr_end) * (1 + math.cos(math.pi * progress)) / 2
             value, _ = loss(data, index, (seed, epoch, k))
@@ -42,7 +42,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
             bar.update()
             bar.set_postfix_str(f"loss {losses[-1]:.3f}", refresh=False)
         with torch.no_grad():  # the same noise and occlusions every epoch
-            batches = trajectories.batches(min(validation, len(held_out[1]) - 1), sequences)
+            batches = trajectories.batches(trajectories.subset(held_out, validation), sequences)
             values, steps = zip(*(loss(held_out, index, (k,)) for k, index in enumerate(batches)))
         validation_loss = float(np.average([v.item() for v in values], weights=steps))
         run.log(epoch=epoch + 1, train_loss=float(np.mean(losses)), validation_loss=validation_loss)

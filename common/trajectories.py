@@ -15,7 +15,7 @@ def load(states_path, offsets_path):
     try:
         states, offsets = np.load(states_path, mmap_mode="r"), np.load(offsets_path)
         whole = states.shape == (offsets[-1], 7)
-    except (ValueError, OSError, IndexError):
+    except (ValueError, OSError, EOFError, IndexError):
         whole = False
     if not whole:
         raise artifacts.UserError(f"{states_path} is damaged: rerun 02_collect.py with --force")
@@ -41,10 +41,15 @@ def padded(data, index):
     return states[start + np.minimum(t, length - 1)], (t < length).astype(np.float32)
 
 
-def batches(count, size, rng=None):
-    """Index arrays of `size` trajectories out of `count`, shuffled by `rng`, in order without."""
-    order = rng.permutation(count) if rng else np.arange(count)
-    return [order[i:i + size] for i in range(0, count, size)]
+def batches(indices, size):
+    """Indices of trajectories in batches of `size`, the last one what is left."""
+    return [indices[i:i + size] for i in range(0, len(indices), size)]
+
+
+def subset(data, count):
+    """Indices of at most `count` trajectories, evenly spaced over a set, which is in the order of its checkpoints."""
+    total = len(data[1]) - 1
+    return np.linspace(0, total - 1, min(count, total)).astype(int)
 
 
 def observe(data, index, seed, device, occlusion=None):
@@ -84,9 +89,9 @@ def error_table(sums):
 
 @torch.no_grad()
 def measure(data, count, size, seed, device, predict, occlusion=None):
-    """Error table of predict(o) -> scaled poses (T, B, 4) over the first `count` trajectories, the same noise for every predict."""
+    """Error table of predict(o) -> scaled poses (T, B, 4) over `count` trajectories, the same noise for every predict."""
     total = {}
-    for k, index in enumerate(batches(min(count, len(data[1]) - 1), size)):
+    for k, index in enumerate(batches(subset(data, count), size)):
         o, s, mask = observe(data, index, (seed, k), device, occlusion)
         for name, sums in pose_errors(predict(o), s[..., :4], o[..., 8], mask).items():
             total[name] = total.get(name, 0) + sums

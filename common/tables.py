@@ -1,0 +1,117 @@
+"""The numbers of sec. 5 and their tables: rates with intervals, paired differences, Markdown."""
+import math
+
+import numpy as np
+
+Z = 1.959964  # 95 % of a normal distribution
+ERRORS = ("trans_mean_l2_mm", "trans_rmse_mm", "rot_mean_abs_deg", "rot_rmse_deg")
+PAPER_ERRORS = {"vision": "49.83, 22.56", "mse": "7.62, 2.51", "likelihood": "6.83, 2.46", "ours": "4.42, 2.10"}
+PAPER_SUCCESS = {"est_uncertainty": "94%", "est": "92%", "est_mse": "64%", "priv_on_estimate": "83%", "end_to_end": "12%",
+                 "behavior_cloning": "38%"}
+PAPER_SWITCHES = {"priv_on_state": "2.68 +- 1.53", "est_uncertainty": "4.22 +- 2.67"}
+
+
+def wilson(values):
+    """Success rate of 0s and 1s with its 95 % Wilson interval."""
+    n, p = len(values), float(np.mean(values))
+    center, half = p + Z**2 / (2 * n), Z * math.sqrt(p * (1 - p) / n + Z**2 / (4 * n**2))
+    low, high = ((center + side * half) / (1 + Z**2 / n) for side in (-1, 1))
+    return {"mean": p, "low": max(0.0, low), "high": min(1.0, high), "episodes": n}
+
+
+def paired(values, reference):
+    """Mean difference over the same episodes with its 95 % interval."""
+    d = np.subtract(values, reference, dtype=float)
+    mean, half = float(d.mean()), Z * float(d.std()) / math.sqrt(len(d))
+    return {"mean": mean, "low": mean - half, "high": mean + half}
+
+
+def spread(values):
+    return {"mean": float(np.mean(values)), "std": float(np.std(values))}
+
+
+def summarise(done):
+    """results.json from {section/key/...: one number an episode, or an error table}, as 05 measures them."""
+    results = {}
+    for name, values in done.items():
+        section, key, *point = name.split("/")
+        rows = results.setdefault(section, {})
+        if section == "estimator_ablation":
+            rows[key] = values
+        elif section == "contact_switches":
+            rows[key] = spread(values) | {"episodes": len(values)}
+        elif section == "occlusion_duration":
+            rows.setdefault(key, {})[point[0]] = wilson(values)
+        elif section == "success_rate":
+            rows.setdefault(key, {})[int(point[0])] = values
+        else:
+            rows[key] = wilson(values)
+    for errors in results["estimator_ablation"].values():
+        vision = results["estimator_ablation"]["vision"]
+        errors |= {f"{key}_of_vision": errors[key] / vision[key] for key in (ERRORS[0], ERRORS[2])}
+    by_seed = results["success_rate"]
+    for method, values in list(by_seed.items()):
+        row = wilson(values[0])
+        if method != "est_uncertainty":
+            row["minus_est_uncertainty"] = paired(values[0], done["success_rate/est_uncertainty/0"])
+        if len(values) > 1:
+            row["seeds"] = spread([np.mean(v) for v in values.values()]) | {"count": len(values)}
+        by_seed[method] = row
+    return results
+
+
+def aligned(header, rows):
+    """A Markdown table whose columns line up: the first to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(header, *rows)]
+    cells = [[row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in (header, *rows)]
+    lines = ["| " + " | ".join(row) + " |" for row in cells]
+    rule = "|" + "|".join("-" * (w + 1) + (":" if i else "-") for i, w in enumerate(widths)) + "|"
+    return "\n".join([lines[0], rule, *lines[1:]])
+
+
+def percent(rate):
+    return f"{rate['mean']:.1%} [{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]"
+
+
+def estimator_ablation(results):
+    """Tab. estimator_ablation, with the share of the vision baseline and the errors where the box is seen and occluded."""
+    rows = []
+    for kind, e in results["estimator_ablation"].items():
+        share = f"{e[f'{ERRORS[0]}_of_vision']:.1%}, {e[f'{ERRORS[2]}_of_vision']:.1%}"
+        parts = [f"{e[part][ERRORS[0]]:.2f}, {e[part][ERRORS[2]]:.2f}" for part in ("seen", "occluded")]
+        rows.append([kind, *(f"{e[key]:.2f}" for key in ERRORS), share, *parts, PAPER_ERRORS[kind]])
+    header = ["estimator", "L2 (mm)", "RMSE (mm)", "abs. (deg)", "RMSE (deg)", "of vision", "seen", "occluded", "paper"]
+    return ("Errors of the estimators on the test set (tab. estimator_ablation); in pairs: mean L2 (mm), mean abs. (deg)\n\n"
+            + aligned(header, rows))
+
+
+def success_rate(results):
+    """Success under occlusion with 95 % intervals, paired differences and, where there are several, the seeds."""
+    rows = []
+    for method, r in results["success_rate"].items():
+        d, s = r.get("minus_est_uncertainty"), r.get("seeds")
+        difference = f"{100 * d['mean']:+.1f} [{100 * d['low']:+.1f}, {100 * d['high']:+.1f}]" if d else ""
+        seeds = f"{s['mean']:.1%} +- {100 * s['std']:.1f} ({s['count']})" if s else ""
+        rows.append([method, percent(r), difference, seeds, PAPER_SUCCESS.get(method, "")])
+    header = ["method", "success [95 %]", "minus est_uncertainty, paired", "mean +- std (seeds)", "paper"]
+    return f"Success on the fixed list of {r['episodes']:,} episodes (sec. 5.2)\n\n" + aligned(header, rows)
+
+
+def occlusion_duration(results):
+    """The numbers of fig. occlusion_duration."""
+    sweep = results["occlusion_duration"]
+    rows = [[method, *map(percent, points.values())] for method, points in sweep.items()]
+    points = next(iter(sweep.values()))
+    header = ["method", *({"0": "none", "full": "full"}.get(name, f"{name} s") for name in points)]
+    title = f"Success by occlusion duration, {points['0']['episodes']:,} episodes a point (fig. occlusion_duration)"
+    return title + "\n\n" + aligned(header, rows)
+
+
+def further(results):
+    """Starts over the whole workspace, sampled actions, contact switches."""
+    lines = [f"- {method}, starts over the whole workspace: success {percent(r)}"
+             for method, r in results["whole_workspace_starts"].items()]
+    lines += [f"- {method}, actions sampled: success {percent(r)}" for method, r in results["sampled_actions"].items()]
+    lines += [f"- {method}: {s['mean']:.2f} +- {s['std']:.2f} contact switches an episode, {s['episodes']:,} episodes "
+              f"(paper: {PAPER_SWITCHES[method]})" for method, s in results["contact_switches"].items()]
+    return "\n".join(lines)

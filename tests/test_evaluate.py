@@ -1,0 +1,218 @@
+import csv
+import importlib
+import json
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from common import film, networks, plots, ppo, stacks, tables, task
+
+evaluate = importlib.import_module("05_evaluate")
+
+
+def players(num_envs=6, seed=0):
+    """Players with small untrained nets instead of a run's."""
+    play = evaluate.Players(SimpleNamespace(num_envs=num_envs, seed=seed, passes=2), {}, torch.device("cpu"))
+    torch.manual_seed(0)
+    nets = {size: networks.policy(size, (8, 8, 8)) for size in (8, 9, 12)}
+    estimator = networks.Estimator((8, 8, 8))
+    inputs = {"est_uncertainty": 12, "end_to_end": 9, "behavior_cloning": 9}
+    play.policy = lambda method, seed: nets[inputs.get(method, 8)]
+    play.estimator = lambda kind: estimator if kind else None
+    return play
+
+
+@pytest.fixture
+def short(monkeypatch):
+    monkeypatch.setattr(task, "HORIZON", 30)
+
+
+def first_rows(play, method, chunk=0, **kw):
+    """First recorded states, observations and dynamics of a chunk."""
+    env = play.play(evaluate.Measurement(method, 6, **kw), chunk)[2]
+    return env.rows, env.unwrapped.dynamics
+
+
+@pytest.mark.parametrize("successes, n, low, high", [(81, 263, 0.2553, 0.3662), (0, 20, 0.0, 0.1611), (20, 20, 0.8389, 1.0),
+                                                     (1880, 2000, 0.9287, 0.9496)])
+def test_wilson_interval_against_published_values(successes, n, low, high):
+    rate = tables.wilson([1] * successes + [0] * (n - successes))
+    assert rate["mean"] == successes / n and rate["episodes"] == n
+    assert rate["low"] == pytest.approx(low, abs=2e-4) and rate["high"] == pytest.approx(high, abs=2e-4)
+
+
+def test_paired_difference_is_narrower_than_the_independent_one():
+    a = np.random.default_rng(0).random(1000) < 0.8
+    b = a.copy()
+    b[:50] = False
+    d = tables.paired(b, a)
+    assert d["mean"] == pytest.approx(b.mean() - a.mean()) and d["low"] < d["mean"] < d["high"] < 0
+    assert d["high"] - d["low"] < 0.03  # independent samples: 0.07
+    assert tables.paired(a, a) == {"mean": 0, "low": 0, "high": 0}
+
+
+def test_every_method_meets_the_same_episodes(short):
+    """Starts, dynamics, bias, noise and xi of the list are the same, whatever the policy does."""
+    play = players()
+    rows, dynamics = first_rows(play, "est_uncertainty")
+    first = rows[0]
+    noise = first["o"][:, [0, 1, 4, 5]] - task.scale(first["state"])[:, [0, 1, 4, 5]]
+    for method in stacks.ESTIMATOR:
+        other, _ = first_rows(play, method)
+        np.testing.assert_array_equal(other[0]["state"], first["state"])
+        if "o" in other[0]:
+            np.testing.assert_array_equal(other[0]["o"], first["o"])
+            assert [r["o"][:, 8].tolist() for r in other[:5]] == [r["o"][:, 8].tolist() for r in rows[:5]]
+    assert np.abs(noise[:, :2]).max() > 0 and not noise[:, 2:].any()
+    assert not np.array_equal(first_rows(play, "est", chunk=1)[0][0]["state"], first["state"])
+    assert not np.array_equal(first_rows(players(seed=1), "est")[0][0]["state"], first["state"])
+
+
+def test_the_occlusion_changes_nothing_but_what_is_hidden(short):
+    play = players()
+    none, full = (first_rows(play, "end_to_end", occlusion=seconds)[0] for seconds in (0.0, math.inf))
+    np.testing.assert_array_equal(none[0]["o"], full[0]["o"])
+    assert not any(row["o"][:, 8].any() for row in none)
+    hidden = np.stack([row["o"][:, 8] for row in full])
+    assert hidden.any() and not (np.diff(hidden[:, hidden.any(0)], axis=0)[:8] < 0).any()
+
+
+def test_an_episode_can_be_played_again(short):
+    play = players()
+    m = evaluate.Measurement("est_uncertainty", 10)
+    bar = SimpleNamespace(update=lambda n: None, set_postfix_str=lambda *a, **k: None)
+    values = play.measure(m, bar, "")
+    assert len(values) == 10 and set(values) <= {0, 1}
+    again = play.episode(m, 7)
+    assert again["success"] == values[7]
+    assert again["state"].shape[1:] == (7,) and again["o"].shape[1:] == (9,) and again["belief"].shape[1:] == (12,)
+    assert len(again["state"]) == len(again["o"]) == len(again["belief"])
+    np.testing.assert_array_equal(again["state"], play.episode(m, 7)["state"])
+
+
+def test_recorded_keeps_the_end_of_an_episode(short):
+    success, length, env = players().play(evaluate.Measurement("est", 6, occlusion=0.0), 0)
+    for world, n in enumerate(length):
+        episode = env.episode(world, n)
+        assert len(episode["state"]) == n + 1
+        moved = np.abs(np.diff(episode["state"][:, 3:5], axis=0)).max()
+        assert moved <= task.MAX_SPEED / task.RATE + 1e-6, "the next episode's start got into this one"
+        error = task.unscale_pose(episode["o"][-1, :4])[:2] - episode["state"][-1, :2]
+        assert np.abs(error).max() < 8 * task.NOISE[0]
+
+
+def made_up(seeds=1):
+    """Values of every measurement, as 05 stores them."""
+    rng = np.random.default_rng(0)
+    row = {"trans_mean_l2_mm": 4.0, "trans_rmse_mm": 3.5, "rot_mean_abs_deg": 2.0, "rot_rmse_deg": 3.0}
+    done = {f"estimator_ablation/{kind}": {k: v * (10 if kind == "vision" else 1) for k, v in row.items()} |
+            {"seen": row, "occluded": row} for kind in evaluate.ESTIMATORS}
+    cfg = evaluate.Config(episodes=40, sweep_episodes=20, switch_episodes=10)
+    for name, m in evaluate.measurements(cfg, {method: range(seeds) for method in evaluate.METHODS}).items():
+        done[name] = rng.integers(0, 2, m.episodes).tolist()
+    return done
+
+
+def test_results_have_the_published_layout():
+    results = json.loads(json.dumps(tables.summarise(made_up())))
+    assert set(results["estimator_ablation"]) == {"vision", "mse", "likelihood", "ours"}
+    assert results["estimator_ablation"]["ours"]["trans_mean_l2_mm_of_vision"] == pytest.approx(0.1)
+    assert set(results["success_rate"]) == set(plots.METHODS)
+    assert set(results["occlusion_duration"]) == set(plots.METHODS) - {"priv_on_state"}
+    for points in results["occlusion_duration"].values():
+        assert list(points) == ["0", "2.5", "5", "10", "full"]
+        assert all(set(p) == {"mean", "low", "high", "episodes"} and p["episodes"] == 20 for p in points.values())
+    assert set(results["contact_switches"]["priv_on_state"]) == {"mean", "std", "episodes"}
+    assert set(results["whole_workspace_starts"]) == {"priv_on_state", "est_uncertainty"}
+
+
+def test_several_seeds_give_mean_and_std_beside_the_first_seeds_interval():
+    done = made_up(seeds=3)
+    row = tables.summarise(done)["success_rate"]["est"]
+    rates = [np.mean(done[f"success_rate/est/{k}"]) for k in range(3)]
+    assert row["mean"] == rates[0]
+    assert row["seeds"] == {"mean": pytest.approx(np.mean(rates)), "std": pytest.approx(np.std(rates)), "count": 3}
+    assert "seeds" not in tables.summarise(made_up())["success_rate"]["est"]
+
+
+def test_tables_line_up_and_hold_every_method():
+    results = tables.summarise(made_up(seeds=2))
+    for section in (tables.estimator_ablation, tables.success_rate, tables.occlusion_duration):
+        text = section(results)
+        lines = [line for line in text.splitlines() if line.startswith("|")]
+        assert len({len(line) for line in lines}) == 1 and len(lines[0]) <= 130
+        assert len({line.count("|") for line in lines}) == 1
+    assert all(f"| {m} " in tables.success_rate(results) for m in plots.METHODS)
+    assert "10.0%, 10.0%" in tables.estimator_ablation(results) and "4.42, 2.10" in tables.estimator_ablation(results)
+    assert "(2)" in tables.success_rate(results) and "94%" in tables.success_rate(results)
+    assert "contact switches" in tables.further(results)
+
+
+def write_metrics(folder, rows):
+    folder.mkdir(parents=True)
+    with open(folder / "metrics.csv", "w") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader(), writer.writerows(rows)
+
+
+def test_curves_take_the_seeds_that_came_as_far_as_the_furthest(tmp_path):
+    for seed, last in enumerate((4, 4, 2)):
+        write_metrics(tmp_path / f"seed{seed}", [dict(steps=i, success=i / 10 + seed) for i in range(last + 1)])
+    x, y = plots.curves(tmp_path, "steps", "success")
+    assert x.tolist() == [0, 1, 2, 3, 4] and y.shape == (2, 5)
+    assert y[1, 4] == pytest.approx(1.4)
+    assert plots.curves(tmp_path / "none", "steps", "success") == (None, None)
+
+
+def shape(path):
+    return cv2.imread(str(path)).shape
+
+
+def test_every_figure_is_drawn_with_whatever_runs_there_are(tmp_path, short):
+    stage, play = tmp_path / "stage", players()
+    for method in ("ours", "mse", "behavior_cloning"):
+        write_metrics(stage / method / "seed0", [dict(epoch=i, train_loss=1, validation_loss=2 / i) for i in (1, 2, 3)])
+    for method, seed in (("est", 0), ("est", 1), ("end_to_end", 0)):
+        write_metrics(stage / method / f"seed{seed}", [dict(steps=i, success=i / 10) for i in range(3)])
+    for name in ("likelihood_loss", "mse_loss", "bc_loss"):
+        plots.validation_loss(stage, name, tmp_path / f"{name}.png")
+    plots.success_rate(stage, tmp_path / "success_rate.png", {"priv_on_estimate": 0.8})
+    plots.success_rate(tmp_path / "empty", tmp_path / "empty.png")
+    plots.success_rate_priv(stage / "est", tmp_path / "success_rate_priv.png")
+    plots.checkpoints([dict(checkpoint=i, episodes=2, success=0.5) for i in range(3)], tmp_path / "checkpoints.png")
+    errors = {"trans_mean_l2_mm": 4.0, "rot_mean_abs_deg": 2.0}
+    plots.passes({m: errors | {"seen": errors, "occluded": errors} for m in (1, 10)}, tmp_path / "passes.png")
+    results = tables.summarise(made_up())
+    plots.occlusion_duration(results["occlusion_duration"], tmp_path / "occlusion_duration.png")
+    plots.sim(tmp_path / "sim.png")
+    pair = {m: play.episode(evaluate.Measurement(m, 6, occlusion=math.inf), 1) for m in ("est_uncertainty", "priv_on_estimate")}
+    plots.trajectory_with_uncertainty(pair, tmp_path / "trajectory.png", 3, 6, 1)
+    images = sorted(tmp_path.glob("*.png"))
+    assert len(images) == 11 and all(min(shape(path)[:2]) >= 350 for path in images)
+    assert not list(tmp_path.rglob(".*"))  # nothing half-written
+
+
+def test_the_film_shows_every_step(tmp_path, short):
+    _, length, env = players().play(evaluate.Measurement("est_uncertainty", 6, occlusion=1.0), 0)
+    episode = env.episode(length.argmax(), length.max())
+    film.write(episode, tmp_path / "film.mp4", tmp_path / "film.gif")
+    video = cv2.VideoCapture(str(tmp_path / "film.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == len(episode["state"]) + task.RATE
+    assert video.get(cv2.CAP_PROP_FPS) == task.RATE
+    with Image.open(tmp_path / "film.gif") as gif:
+        assert gif.size == (480, 300) and gif.n_frames > length.max() // 4
+
+
+def test_the_film_marks_an_occlusion():
+    state = np.array([0.1, 0.05, 0.3, -0.1, 0.0, 1.0, 0.0])
+    o = np.append(task.scale(state), 0.0)
+    belief = np.append(task.scale(state), [0.02] * 4)
+    seen = film.frame(state, o, belief, 0)
+    hidden = film.frame(state, np.append(o[:8], 1.0), belief, 0)
+    assert tuple(hidden[0, 0]) == film.HELD and tuple(seen[0, 0]) != film.HELD

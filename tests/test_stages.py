@@ -1,0 +1,349 @@
+"""The numbered scripts, in the smoke preset: once in order, stopped and resumed, and with what goes wrong."""
+import csv
+import importlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from common import artifacts, networks, ppo, stacks, task, trajectories
+
+ROOT = Path(__file__).parent.parent
+SCRIPTS = ["01_train_privileged", "02_collect", "03_train_estimator", "04_train_policy", "05_evaluate"]
+SETS = {"train": 48, "validation": 12, "test": 12, "teacher_train": 48, "teacher_validation": 12}
+ESTIMATORS = {"ours", "likelihood", "mse"}
+POLICIES = {"est_uncertainty", "est", "est_mse", "end_to_end", "behavior_cloning"}
+OUTPUTS = {
+    "01_train_privileged/seed0": ["policy.safetensors", "value.safetensors", "checkpoint_000.safetensors",
+                                  "checkpoint_001.safetensors", "checkpoint_002.safetensors", "success_rate_priv.png"],
+    "02_collect/seed0": [file for name in SETS for file in trajectories.files(name)] + ["success.png"],
+    "03_train_estimator/ours/seed0": ["estimator.safetensors", "likelihood_loss.png", "passes.json", "passes.png"],
+    "03_train_estimator/likelihood/seed0": ["estimator.safetensors", "likelihood_loss.png"],
+    "03_train_estimator/mse/seed0": ["estimator.safetensors", "mse_loss.png"],
+    "04_train_policy/behavior_cloning/seed0": ["policy.safetensors", "bc_loss.png"],
+    "05_evaluate/seed0": ["results.json", "tables.md", "success_rate.png", "occlusion_duration.png", "sim.png",
+                          "trajectory_with_uncertainty.png", "film.mp4", "film.gif"],
+} | {f"04_train_policy/{m}/seed0": ["policy.safetensors", "success_rate.png"] for m in POLICIES - {"behavior_cloning"}}
+
+
+def start(out, script, *args):
+    command = [sys.executable, ROOT / f"{script}.py", "smoke", "--out", out, "--device", "cpu", *args]
+    return subprocess.Popen(command, env=os.environ | {"OMP_NUM_THREADS": "1"}, cwd=out.parent, text=True,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def run(out, script, *args):
+    """Runs a script to its end; returns what it printed."""
+    process = start(out, script, *args)
+    stdout, stderr = process.communicate()
+    assert process.returncode == 0, stderr
+    return stdout
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """The root of a whole smoke study. Not to be changed."""
+    out = tmp_path_factory.mktemp("study") / "runs"
+    for script in SCRIPTS:
+        run(out, script)
+    return out
+
+
+@pytest.fixture
+def copy(study, tmp_path):
+    """Copies the study's stages before the n-th."""
+    def of(stages):
+        for script in SCRIPTS[:stages]:
+            shutil.copytree(study / "smoke" / script, tmp_path / "runs" / "smoke" / script)
+        return tmp_path / "runs"
+    return of
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Runs a script in this process, which spares the imports; returns stdout, stderr and the exit code."""
+    def of(out, script, *args):
+        monkeypatch.setattr(sys, "argv", [str(ROOT / f"{script}.py"), "smoke", "--out", str(out), "--device", "cpu", *args])
+        module, code = importlib.import_module(script), 0
+        try:
+            artifacts.main(module.Config, module.PRESETS, module.main, module.__doc__)
+        except SystemExit as end:
+            code = end.code
+        return *capsys.readouterr(), code
+    return of
+
+
+def is_mistake(stdout, stderr, code, *words):
+    """One line on stderr that says `words`, and exit code 2."""
+    lines = [line for line in stderr.splitlines() if line.strip()]
+    return code == 2 and len(lines) == 1 and lines[0].startswith("error: ") and all(word in lines[0] for word in words)
+
+
+def weights(folder):
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("*.safetensors"))}
+
+
+def metrics(folder):
+    """metrics.csv without the speed."""
+    with open(folder / "metrics.csv") as file:
+        return [{key: x for key, x in row.items() if key != "steps_per_s"} for row in csv.DictReader(file)]
+
+
+# Once in order
+
+
+@pytest.mark.parametrize("folder", OUTPUTS)
+def test_every_output_is_there(study, folder):
+    folder, names = study / "smoke" / folder, OUTPUTS[folder]
+    assert {path.name for path in folder.iterdir()} == {*names, "config.json", "metrics.csv"} - (
+        {"metrics.csv"} if folder.parent.name == "05_evaluate" else set())
+    assert json.loads((folder / "config.json").read_text())["finished"]
+    assert all(cv2.imread(str(path)).std() > 1 for path in folder.glob("*.png"))
+
+
+def test_nothing_else_was_written(study):
+    folders = {path.parent.relative_to(study / "smoke").as_posix() for path in study.rglob("*") if path.is_file()}
+    assert folders == set(OUTPUTS) and [path.name for path in study.parent.iterdir()] == ["runs"]
+
+
+def test_checkpoints_go_from_the_untrained_to_the_last_policy(study):
+    folder = study / "smoke" / "01_train_privileged" / "seed0"
+    torch.manual_seed(0)
+    untrained = networks.policy(8, (16, 16, 16)).state_dict()
+    first, middle, last = (artifacts.load_tensors(path)[0] for path in sorted(folder.glob("checkpoint_*")))
+    policy = artifacts.load_tensors(folder / "policy.safetensors")[0]
+    assert all(first[name].equal(untrained[name]) and last[name].equal(policy[name]) for name in policy)
+    assert not any(middle[name].equal(x[name]) for x in (first, last) for name in policy)
+
+
+def test_success_is_logged_on_schedule(study):
+    rows = metrics(study / "smoke" / "01_train_privileged" / "seed0")
+    assert [(int(row["update"]), int(row["steps"])) for row in rows] == [(0, 0), (3, 3 * 512), (6, 6 * 512)]
+    assert all(0 <= float(row["success"]) <= 1 for row in rows)
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_trajectories_are_whole_episodes_of_the_study(study, name):
+    folder = study / "smoke" / "02_collect" / "seed0"
+    states, offsets = trajectories.load(*(folder / file for file in trajectories.files(name)))
+    lengths, first, last = np.diff(offsets), states[offsets[:-1]], states[offsets[1:] - 1]
+    assert len(lengths) == SETS[name] and lengths.min() >= 1 and lengths.max() <= task.HORIZON
+    assert states.dtype == np.float32 and np.isfinite(states).all()
+    assert (np.abs(first[:, :2]) <= task.START_BOX + 1e-6).all() and not first[:, 5:].any()
+    assert not task.outside(states[:, :3], states[:, 3:5]).any() and not task.reached(states[:, :3]).any()
+    assert (np.linalg.norm(np.diff(states[:, 3:5], axis=0), axis=1)[np.diff(np.repeat(np.arange(len(lengths)), lengths)) == 0]
+            <= task.MAX_SPEED * np.sqrt(2) / task.RATE + 1e-6).all()
+    ended = lengths < task.HORIZON  # one step from the edge, or from the target
+    edge = np.minimum(task.HALF - np.abs(last[:, :2]), task.HALF - np.abs(last[:, 3:5])).min(1)
+    assert ((edge < 0.006) | (np.linalg.norm(last[:, :2], axis=1) < 0.016))[ended].all()
+
+
+def test_every_checkpoint_plays_as_many_episodes(study):
+    rows = metrics(study / "smoke" / "02_collect" / "seed0")
+    teacher = SETS["teacher_train"] + SETS["teacher_validation"]
+    assert [int(row["episodes"]) for row in rows] == [24, 24, 24 + teacher]
+
+
+def test_inputs_are_recorded(study):
+    inputs = json.loads((study / "smoke/04_train_policy/est_mse/seed0/config.json").read_text())["inputs"]
+    assert "03_train_estimator/mse/seed0/estimator.safetensors" in inputs
+    assert "01_train_privileged/seed0/policy.safetensors" in inputs
+
+
+def test_errors_against_passes(study):
+    errors = json.loads((study / "smoke/03_train_estimator/ours/seed0/passes.json").read_text())
+    assert list(errors) == ["1", "2", "5", "10", "20", "50"]
+    assert all(row["trans_mean_l2_mm"] > 0 and row["seen"]["rot_rmse_deg"] > 0 for row in errors.values())
+
+
+def test_results_have_every_number(study):
+    results = json.loads((study / "smoke/05_evaluate/seed0/results.json").read_text())
+    methods = POLICIES | {"priv_on_estimate", "priv_on_state"}
+    numbers = {"trans_mean_l2_mm", "trans_rmse_mm", "rot_mean_abs_deg", "rot_rmse_deg"}
+    assert results["estimator_ablation"].keys() == ESTIMATORS | {"vision"}
+    for row in results["estimator_ablation"].values():
+        assert numbers <= row.keys() and numbers <= row["seen"].keys() and numbers <= row["occluded"].keys()
+    assert results["success_rate"].keys() == methods
+    assert results["occlusion_duration"].keys() == methods - {"priv_on_state"}
+    assert all(list(row) == ["0", "2.5", "5", "10", "full"] for row in results["occlusion_duration"].values())
+    assert results["whole_workspace_starts"].keys() == {"priv_on_state", "est_uncertainty"}
+    rates = [*results["success_rate"].values(), *results["whole_workspace_starts"].values()]
+    for rate in rates + [rate for row in results["occlusion_duration"].values() for rate in row.values()]:
+        assert 0 <= rate["low"] <= rate["mean"] <= rate["high"] <= 1 and rate["high"] > rate["low"]
+    assert {rate["episodes"] for rate in rates} == {16}
+    assert results["contact_switches"].keys() == {"priv_on_state", "est_uncertainty"}
+    assert all(row["mean"] >= 0 and row["std"] >= 0 and row["episodes"] == 16 for row in results["contact_switches"].values())
+
+
+def test_the_vision_baseline_is_the_held_pose(study):
+    """Recomputed on the test set with other draws: occlusions of an almost still box hide little."""
+    folder = study / "smoke" / "02_collect" / "seed0"
+    test = trajectories.load(*(folder / file for file in trajectories.files("test")))
+    table = trajectories.measure(test, 12, 100, 1, "cpu", lambda o: o[..., :4])
+    vision = json.loads((study / "smoke/05_evaluate/seed0/results.json").read_text())["estimator_ablation"]["vision"]
+    assert vision["seen"]["trans_rmse_mm"] == pytest.approx(table["seen"]["trans_rmse_mm"], rel=0.6)
+
+
+def test_the_film_plays(study):
+    film = cv2.VideoCapture(str(study / "smoke/05_evaluate/seed0/film.mp4"))
+    ok, frame = film.read()
+    assert ok and frame.std() > 1
+
+
+def test_a_second_run_does_nothing(study, call):
+    files = {path: path.stat().st_mtime_ns for path in study.rglob("*") if path.is_file() and path.name != "config.json"}
+    for script in SCRIPTS:
+        stdout, stderr, code = call(study, script)
+        assert code == 0 and not stderr
+        assert stdout.count("finished already (--force redoes it)") == sum(script in folder for folder in OUTPUTS)
+    assert files == {path: path.stat().st_mtime_ns for path in study.rglob("*") if path.is_file() and path.name != "config.json"}
+
+
+# Stopped and resumed
+
+
+@pytest.mark.parametrize("script, method, stops", [("01_train_privileged", "", 2), ("03_train_estimator", "ours", 1),
+                                                   ("04_train_policy", "est", 1), ("04_train_policy", "behavior_cloning", 1)])
+def test_a_stopped_run_ends_bit_for_bit_as_an_uninterrupted_one(study, copy, script, method, stops):
+    out, which = copy(SCRIPTS.index(script)), ["--method", method] if method else []
+    for _ in range(stops):
+        assert "stopped after" in run(out, script, *which, "--max-minutes", "0")
+    assert "stopped after" not in run(out, script, *which, "--max-minutes", "0")
+    here, there = (root / "smoke" / script / method / "seed0" for root in (out, study))
+    assert weights(here) == weights(there)
+    assert metrics(here) == metrics(there)
+
+
+def test_a_stopped_collection_goes_on_where_it_was(study, copy, call):
+    out, states = copy(1), "smoke/02_collect/seed0/train_states.npy"
+    for _ in range(20):
+        stdout, _, code = call(out, "02_collect", "--max-minutes", "0")
+        assert code == 0
+        if "stopped after" not in stdout:
+            break
+    assert (out / states).read_bytes() == (study / states).read_bytes()
+
+
+def test_a_killed_run_ends_bit_for_bit_as_an_uninterrupted_one(study, tmp_path):
+    script = "01_train_privileged"
+    here, there = (root / "smoke" / script / "seed0" for root in (tmp_path / "runs", study))
+    process = start(tmp_path / "runs", script)
+    while not (here / "resume.pt").exists() and process.poll() is None:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL and not (here / "policy.safetensors").exists()
+    run(tmp_path / "runs", script)
+    assert weights(here) == weights(there) and metrics(here) == metrics(there)
+
+
+# What goes wrong
+
+
+@pytest.mark.parametrize("script, needed", [("02_collect", "01_train_privileged"), ("03_train_estimator", "02_collect"),
+                                            ("04_train_policy", "01_train_privileged"), ("05_evaluate", "04_train_policy")])
+def test_a_missing_stage_is_named(tmp_path, call, script, needed):
+    assert is_mistake(*call(tmp_path / "runs", script), f"run python {needed}.py smoke", "first")
+
+
+def test_a_missing_estimator_is_named(copy, call):
+    out = copy(2)
+    result = call(out, "04_train_policy", "--method", "est_mse")
+    assert is_mistake(*result, "run python 03_train_estimator.py smoke --method mse", "first")
+
+
+@pytest.mark.parametrize("damage", ["deleted", "cut", "changed"])
+@pytest.mark.parametrize("script, file, needed", [
+    ("02_collect", "01_train_privileged/seed0/checkpoint_001.safetensors", "python 01_train_privileged.py smoke"),
+    ("03_train_estimator", "02_collect/seed0/train_states.npy", "python 02_collect.py smoke"),
+    ("04_train_policy", "03_train_estimator/ours/seed0/estimator.safetensors", "python 03_train_estimator.py smoke --method ours"),
+    ("05_evaluate", "04_train_policy/est/seed0/policy.safetensors", "python 04_train_policy.py smoke --method est")])
+def test_a_damaged_input_names_its_stage(copy, call, script, file, needed, damage):
+    out = copy(SCRIPTS.index(script))
+    path = out / "smoke" / file
+    whole = path.read_bytes()
+    match damage:
+        case "deleted":
+            path.unlink()
+        case "cut":
+            path.write_bytes(whole[:-100])
+        case "changed":
+            path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    assert is_mistake(*call(out, script), "missing or damaged", f"run {needed}", "--force")
+
+
+def test_a_stale_input_names_the_stage_to_redo(copy, call):
+    out = copy(3)
+    assert call(out, "01_train_privileged", "--force", "--lr", "2e-3")[2] == 0
+    assert is_mistake(*call(out, "02_collect"), "inputs changed", "checkpoint_002.safetensors", "--force")
+    assert is_mistake(*call(out, "03_train_estimator"), "stale", "run python 02_collect.py smoke", "--force")
+    assert is_mistake(*call(out, "04_train_policy"), "stale", "--force")
+
+
+def test_mistakes_on_the_command_line_are_one_line(tmp_path):
+    for args, words in ((["--lerning-rate", "1"], ["--lerning-rate", "--help"]), (["--updates", "many"], ["--updates", "many"]),
+                        (["--checkpoints", "1"], ["--checkpoints 1"])):
+        process = start(tmp_path / "runs", "01_train_privileged", *args)
+        assert is_mistake(*process.communicate(), process.returncode, *words)
+    assert not (tmp_path / "runs").exists()
+
+
+# The paper's nets
+
+
+def paper(script, **kw):
+    """A script as a module, and its paper's config with less to do."""
+    module = importlib.import_module(script)
+    return module, module.Config(device="cpu", epochs=1, **kw)
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Five trajectories instead of any set."""
+    states = np.random.default_rng(0).uniform(-0.1, 0.1, (100, 7)).astype(np.float32)
+    data = states, np.array([0, 30, 40, 50, 90, 100])
+    monkeypatch.setattr(trajectories, "load_set", lambda cfg, name: (data, {}))
+    return data
+
+
+def test_ppo_updates_the_papers_nets_with_the_papers_estimator():
+    module, cfg = paper("04_train_policy", num_envs=8)
+    env = stacks.make("est_uncertainty", cfg.num_envs, networks.Estimator().requires_grad_(False), cfg.passes)
+    actor, critic = networks.policy(12, cfg.sizes), networks.value(12, cfg.sizes)
+    optimizers = [torch.optim.Adam(net.parameters(), lr=cfg.lr) for net in (actor, critic)]
+    carry, before = (env.reset(seed=0)[0], actor.initial(8), critic.initial(8)), actor.encoder.weight.clone()
+    batch, _ = ppo.rollout(env, actor, critic, carry, 10)
+    stats = ppo.update(actor, critic, optimizers, ppo.sequences(batch, critic, cfg.gamma, cfg.lam), cfg)
+    assert batch["obs"].shape == (10, 8, 12) and np.isfinite(list(stats.values())).all()
+    assert not actor.encoder.weight.equal(before)
+
+
+def test_the_papers_estimator_takes_an_update(tmp_path, few):
+    module, cfg = paper("03_train_estimator", method="ours", out=tmp_path)
+    run = artifacts.Run(cfg, "03_train_estimator", {}, "ours")
+    assert module.train(run, cfg, few, few, torch.device("cpu"))
+    f = networks.load_estimator(run.dir / "estimator.safetensors")
+    torch.manual_seed(0)
+    assert f.sizes == (1024, 512, 256) and not f.lstm.weight_hh_l0.equal(networks.Estimator().lstm.weight_hh_l0)
+
+
+def test_the_papers_student_takes_an_update_toward_its_teacher(tmp_path, few):
+    module, cfg = paper("04_train_policy", method="behavior_cloning", bc_epochs=8, out=tmp_path)
+    networks.save_recurrent(path := tmp_path / "teacher.safetensors", teacher := networks.policy(8))
+    with torch.no_grad():
+        teacher.head[-1].bias[3] = teacher.head[-1].bias[11 + 7] = 3.0
+    networks.save_recurrent(path, teacher)
+    run = artifacts.Run(cfg, "04_train_policy", {}, "behavior_cloning")
+    student = module.train_bc(run, cfg, {"policy": path}, torch.device("cpu"))
+    losses = [row["validation_loss"] for row in run.rows()]
+    assert tuple(student.sizes) == (128, 256, 128) and losses[-1] < losses[0] - 0.5
+    assert (networks.mode(student(torch.zeros(1, 1, 9))[0]) == torch.tensor([3, 7])).all()

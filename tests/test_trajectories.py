@@ -1,0 +1,126 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from common import task, trajectories
+from common.artifacts import UserError
+
+LENGTHS = [3, 1, 40, 7]
+
+
+@pytest.fixture
+def data():
+    rng = np.random.default_rng(0)
+    states = rng.uniform(-1, 1, (sum(LENGTHS), 7)).astype(np.float32) * np.float32([0.3, 0.15, np.pi, 0.3, 0.15, 5, 5])
+    return states, np.cumsum([0, *LENGTHS])
+
+
+@pytest.fixture
+def paths(data, tmp_path):
+    paths = [tmp_path / name for name in trajectories.files("test")]
+    for path, array in zip(paths, data):
+        np.save(path, array)
+    return paths
+
+
+def test_stored_trajectories_come_back(data, paths):
+    states, offsets = trajectories.load(*paths)
+    assert isinstance(states, np.memmap) and (states == data[0]).all() and (offsets == data[1]).all()
+
+
+@pytest.mark.parametrize("damage", ["gone", "empty", "cut", "other", "offsets gone", "offsets empty", "offsets cut"])
+def test_damaged_files_name_the_stage(paths, damage):
+    path = paths[damage.startswith("offsets")]
+    match damage.split()[-1]:
+        case "gone":
+            path.unlink()
+        case "empty":
+            path.write_bytes(b"")
+        case "cut":
+            path.write_bytes(path.read_bytes()[:-30])
+        case "other":
+            np.save(path, np.zeros((9, 7), np.float32))
+    with pytest.raises(UserError, match="test_states.npy is damaged: rerun 02_collect.py"):
+        trajectories.load(*paths)
+
+
+def test_padding_repeats_the_last_state(data):
+    states, mask = trajectories.padded(data, np.array([2, 1, 0]))
+    assert states.shape == (40, 3, 7) and mask.sum(0).tolist() == [40, 1, 3]
+    assert (states[:, 0] == data[0][4:44]).all() and (states[:, 1] == data[0][3]).all()
+    assert (states[:3, 2] == data[0][:3]).all() and (states[3:, 2] == data[0][2]).all()
+    assert (np.diff(mask, axis=0) <= 0).all()
+
+
+def test_batches_take_every_trajectory_once():
+    order = np.random.default_rng(0).permutation(10)
+    taken = trajectories.batches(order, 4)
+    assert [len(batch) for batch in taken] == [4, 4, 2] and np.concatenate(taken).tolist() == order.tolist()
+
+
+@pytest.mark.parametrize("count, indices", [(1, [0]), (2, [0, 3]), (4, [0, 1, 2, 3]), (9, [0, 1, 2, 3])])
+def test_a_subset_is_spread_over_the_checkpoints(data, count, indices):
+    assert trajectories.subset(data, count).tolist() == indices
+
+
+def test_observed_batches_are_the_seeds(data):
+    index = np.array([0, 2])
+    o, s, mask = trajectories.observe(data, index, (1, 2), "cpu")
+    assert o.shape == (40, 2, 9) and s.shape == (40, 2, 8) and mask.shape == (40, 2)
+    assert s[0].equal(torch.as_tensor(task.scale(data[0][[0, 4]])))
+    assert (o[..., 4:6] == s[..., 4:6]).all()
+    assert o.equal(trajectories.observe(data, index, (1, 2), "cpu")[0])
+    assert not o.equal(trajectories.observe(data, index, (1, 3), "cpu")[0])
+
+
+def plain_table(q_hat, q, chosen):
+    """The numbers of tab. estimator_ablation, one step at a time."""
+    shifts, turns = [], []
+    for t, b in np.argwhere(chosen):
+        shifts.append((q_hat[t, b, :2] - q[t, b, :2]) * task.HALF * 1e3)
+        turn = math.atan2(*q_hat[t, b, 2:]) - math.atan2(*q[t, b, 2:])
+        turns.append(math.degrees(math.atan2(math.sin(turn), math.cos(turn))))
+    shifts, turns = np.array(shifts), np.array(turns)
+    return {"trans_mean_l2_mm": np.hypot(*shifts.T).mean(), "trans_rmse_mm": np.sqrt((shifts**2).mean()),
+            "rot_mean_abs_deg": np.abs(turns).mean(), "rot_rmse_deg": np.sqrt((turns**2).mean())}
+
+
+def test_errors_are_those_of_a_plain_loop():
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(-np.pi, np.pi, (50, 6))
+    near = angle + rng.normal(0, 0.5, angle.shape)  # some on the other side of +-pi
+    q, q_hat = (np.concatenate([rng.uniform(-1, 1, (50, 6, 2)), scale * np.stack([np.sin(a), np.cos(a)], -1)], -1)
+                for a, scale in ((angle, 1.0), (near, 0.7)))
+    mask = np.arange(50)[:, None] < [50, 1, 20, 33, 5, 49]
+    hidden = rng.random((50, 6)) < 0.4
+    tensors = [torch.as_tensor(x) for x in (q_hat, q, hidden.astype(np.float32), mask.astype(np.float32))]
+    halves = [trajectories.pose_errors(*(x[:, part] for x in tensors)) for part in (slice(0, 2), slice(2, 6))]
+    table = trajectories.error_table({name: halves[0][name] + halves[1][name] for name in halves[0]})
+    for name, chosen in (("seen", mask & ~hidden), ("occluded", mask & hidden)):
+        assert table.pop(name) == pytest.approx(plain_table(q_hat, q, chosen))
+    assert table == pytest.approx(plain_table(q_hat, q, mask))
+
+
+def test_angles_are_compared_around_the_circle():
+    q, q_hat = (torch.tensor([[[0.0, 0.0, math.sin(a), math.cos(a)]]]) for a in (math.radians(179), math.radians(-179)))
+    table = trajectories.error_table(trajectories.pose_errors(q_hat, q, torch.zeros(1, 1), torch.ones(1, 1)))
+    assert table["rot_mean_abs_deg"] == pytest.approx(2, abs=1e-3) and table["rot_rmse_deg"] == pytest.approx(2, abs=1e-3)
+
+
+def test_vision_alone_has_the_errors_of_its_noise():
+    states = np.zeros((3000 * 20, 7), np.float32)
+    table = trajectories.measure((states, np.arange(0, 60_001, 20)), 3000, 500, 0, "cpu", lambda o: o[..., :4], occlusion=0)
+    assert table["trans_rmse_mm"] == pytest.approx(2.5 * math.sqrt(2), rel=0.03)
+    assert table["trans_mean_l2_mm"] == pytest.approx(2.5 * math.sqrt(2) * math.sqrt(math.pi / 2), rel=0.03)
+    assert table["rot_rmse_deg"] == pytest.approx(math.degrees(0.05 * math.sqrt(2)), rel=0.03)
+    assert table["seen"] == pytest.approx({k: v for k, v in table.items() if isinstance(v, float)})
+
+
+def test_every_estimator_is_measured_under_the_same_noise(data):
+    seen = []
+    for _ in range(2):
+        trajectories.measure(data, 3, 2, 5, "cpu", lambda o: seen.append(o) or o[..., :4])
+    assert [o.shape[1] for o in seen] == [2, 1, 2, 1]  # three trajectories, two at a time
+    assert seen[0].equal(seen[2]) and seen[1].equal(seen[3])
