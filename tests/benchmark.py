@@ -30,14 +30,14 @@ def rate(work, steps, seconds=2.0):
 
 
 def line(what, value, unit="steps/s"):
-    print(f"{what:<62} {value:>12,.0f} {unit}", flush=True)
+    print(f"{what:<76} {value:>10,.0f} {unit}", flush=True)
 
 
-def play(env):
-    """Ten steps of random actions in every world; their number."""
+def play(env, steps=10):
+    """So many steps of random actions in every world, and their number."""
     env.reset(seed=0)
     actions = rng.integers(0, 11, (100, env.num_envs, 2))
-    return lambda: [env.step(actions[rng.integers(100)]) for _ in range(10)], 10 * env.num_envs
+    return lambda: [env.step(actions[rng.integers(100)]) for _ in range(steps)], steps * env.num_envs
 
 
 def learn(what, preset, **changes):
@@ -76,9 +76,8 @@ def main():
         stage = importlib.import_module("03_train_estimator")
         estimator = networks.Estimator(stage.Config(**stage.PRESETS[preset]).sizes).requires_grad_(False)
         for passes in (1, 4, 10, 50):
-            num = 128 if preset == "paper" and passes == 50 else WORLDS
-            stack = stacks.make("est_uncertainty", num, estimator, passes)
-            line(f"{name} estimator in the loop, all included, M = {passes}, {num} worlds", rate(*play(stack)))
+            stack = stacks.make("est_uncertainty", WORLDS, estimator, passes)
+            line(f"{name} estimator in the loop, all included, M = {passes}, {WORLDS} worlds", rate(*play(stack, 2)))
     learn("quick's pi_priv", "quick")
     learn("paper's nets, 1024 worlds x 32 steps", "paper", num_envs=WORLDS, rollout_steps=32)
 

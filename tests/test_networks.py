@@ -187,9 +187,9 @@ def test_mse_is_over_valid_steps():
 
 def test_nets_come_back_from_files(tmp_path):
     net, f = networks.policy(12, (8, 6, 4)), small(dropout=0.0, likelihood=False)
-    networks.save_recurrent(tmp_path / "policy.safetensors", net)
-    networks.save_estimator(tmp_path / "f.safetensors", f)
-    again, f_again = networks.load_recurrent(tmp_path / "policy.safetensors"), networks.load_estimator(tmp_path / "f.safetensors")
+    networks.save_recurrent(policy := tmp_path / "policy.safetensors", net)
+    networks.save_estimator(estimator := tmp_path / "estimator.safetensors", f)
+    again, f_again = networks.load_recurrent(policy), networks.load_estimator(estimator)
     x = torch.randn(3, 2, 12)
     assert again(x)[0].equal(net(x)[0]) and not again.encoder.weight.requires_grad
     assert f_again(INPUTS)[0].equal(f(INPUTS)[0]) and (f_again.dropout, f_again.likelihood) == (0.0, False)

@@ -13,7 +13,7 @@ bfloat16 = pytest.mark.skipif(not torch.cpu._is_avx512_bf16_supported(), reason=
 
 
 class ToyEnv(gym.vector.VectorEnv):
-    """Worlds whose episodes end by themselves, in the form of PushVectorEnv (SAME_STEP autoreset, final_obs for all worlds)."""
+    """Worlds whose episodes end by themselves, in PushVectorEnv's form: SAME_STEP autoreset, final_obs of all worlds."""
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
     size = 3
@@ -130,14 +130,33 @@ def test_a_rollout_keeps_what_the_env_said():
     torch.testing.assert_close(batch["logp"].exp().sum(-1), torch.ones(30, 5, 2))
 
 
+def test_rollouts_follow_one_another(float32):
+    """Thirty rollouts of one step see what one of thirty steps saw, and each knows what comes next."""
+    actor, critic = nets()
+    env = Noise(3)
+    carry = env.reset()[0], actor.initial(3), critic.initial(3)
+    pieces = []
+    for _ in range(30):
+        batch, carry = ppo.rollout(env, actor, critic, carry, 1)
+        pieces.append(batch)
+        going_on = ~batch["done"][0]
+        assert (batch["final"][0][going_on].numpy() == carry[0][going_on]).all()
+    assert not all(batch["done"].any() for batch in pieces)
+    for net, name in ((actor, "hidden_pi"), (critic, "hidden_v")):
+        hidden = net.initial(3)
+        for batch in pieces:
+            torch.testing.assert_close(batch[name], hidden)
+            hidden = networks.forget(net(batch["obs"], hidden)[1], batch["done"][0])
+
+
 def test_whole_sequences_begin_after_episode_ends():
     done = torch.tensor([[0, 0, 1, 0, 0], [0, 0, 0, 0, 0], [0, 0, 0, 0, 1]]).bool().T
     position, sequence, world, start = ppo.split(done)
     assert position.T.tolist() == [[0, 1, 2, 0, 1], [0, 1, 2, 3, 4], [0, 1, 2, 3, 4]]
     assert sequence.T.tolist() == [[0, 0, 0, 1, 1], [2] * 5, [3] * 5]
     assert world.tolist() == [0, 0, 1, 2] and start.tolist() == [0, 3, 0, 0]
-    x = torch.arange(1, 16).view(3, 5).T
-    assert ppo.pad(x, position, sequence).T.tolist() == [[1, 2, 3, 0, 0], [4, 5, 0, 0, 0], [6, 7, 8, 9, 10], [11, 12, 13, 14, 15]]
+    padded = ppo.pad(torch.arange(1, 16).view(3, 5).T, position, sequence)
+    assert padded.T.tolist() == [[1, 2, 3, 0, 0], [4, 5, 0, 0, 0], [6, 7, 8, 9, 10], [11, 12, 13, 14, 15]]
 
 
 # Advantages
