@@ -2,8 +2,9 @@
 
     python 01_train_privileged.py [smoke|quick|laptop|paper] [--seed k] [--field value ...]
 
-Writes runs/<preset>/01_train_privileged/seed<k>/: policy.safetensors, value.safetensors, checkpoint_*.safetensors (uniformly spaced over
-training, the untrained net first), metrics.csv, success_rate_priv.png (all seeds that are there). Resumes where it stopped.
+Writes runs/<preset>/01_train_privileged/seed<k>/: policy.safetensors, value.safetensors, checkpoint_*.safetensors
+(uniformly spaced over training, the untrained net first), metrics.csv, success_rate_priv.png (all seeds that are there).
+Resumes where it stopped.
 """
 from dataclasses import dataclass
 
@@ -23,8 +24,8 @@ class Config(ppo.Hyperparameters, artifacts.Stage):
 PRESETS = {
     "smoke": dict(num_envs=32, rollout_steps=16, updates=6, minibatch=256, epochs=2, sizes=(16, 16, 16), checkpoints=3,
                   eval_every=3, eval_episodes=16, resume_every=2, tolerance=4.0, near_share=0.5),
-    "quick": dict(num_envs=1024, rollout_steps=32, updates=800, minibatch=4096, epochs=3, sizes=(64, 128, 64), checkpoints=40,
-                  entropy=0.002, kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.8),
+    "quick": dict(num_envs=1024, rollout_steps=32, updates=500, minibatch=4096, epochs=3, sizes=(64, 128, 64),
+                  checkpoints=26, entropy=0.002, kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.8),
     "laptop": dict(num_envs=1024, rollout_steps=32, updates=4000, minibatch=4096, epochs=3, checkpoints=100, entropy=0.002,
                    kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.8),
     "paper": {},

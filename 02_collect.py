@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from common import artifacts, networks, plots, ppo, task, trajectories
+from common import artifacts, episodes, networks, plots, task, trajectories
 from common.env import PushVectorEnv
 from common.symmetry import Mirrored
 
@@ -44,20 +44,20 @@ def jobs(cfg, checkpoints):
         count = getattr(cfg, name.removeprefix("teacher_"))
         players = [checkpoints - 1] if name.startswith("teacher") else range(checkpoints)
         share = [count * (i + 1) // len(players) - count * i // len(players) for i in range(len(players))]
-        for player, episodes in zip(players, share):
-            for first in range(0, episodes, cfg.num_envs):
-                yield name, player, min(cfg.num_envs, episodes - first)
+        for player, part in zip(players, share):
+            for first in range(0, part, cfg.num_envs):
+                yield name, player, min(cfg.num_envs, part - first)
 
 
-def collect(policy, episodes, seed):
-    """States (steps, 7) and lengths of one episode in each of `episodes` worlds, actions sampled; and their success."""
-    states = np.empty((task.HORIZON, episodes, 7), np.float32)
+def collect(policy, num_envs, seed):
+    """States (steps, 7) and lengths of one episode in each of `num_envs` worlds, actions sampled; and their success."""
+    states = np.empty((task.HORIZON, num_envs, 7), np.float32)
 
     def record(t, obs, env, running):
         states[t] = env.unwrapped.state
 
     torch.manual_seed(seed)
-    success, length = ppo.play(Mirrored(PushVectorEnv(episodes)), policy, seed, greedy=False, record=record)
+    success, length = episodes.play(Mirrored(PushVectorEnv(num_envs)), policy, seed, greedy=False, record=record)
     valid = np.arange(task.HORIZON)[:, None] < length
     return states.swapaxes(0, 1)[valid.T], length, success
 
@@ -94,12 +94,12 @@ def main(cfg):
     left = [k for k, part in enumerate(parts) if not part.exists()]
     bar = artifacts.bar(sum(todo[k][2] for k in left), "02_collect", unit="trajectory")
     for k in left:
-        name, player, episodes = todo[k]
+        name, player, count = todo[k]
         policy = networks.load_recurrent(paths[player], device)
         seed = int(np.random.SeedSequence([cfg.seed, k]).generate_state(1)[0])
-        states, length, success = collect(policy, episodes, seed)
+        states, length, success = collect(policy, count, seed)
         artifacts.write_atomic(parts[k], lambda path: np.savez(path, states=states, length=length, success=success))
-        bar.update(episodes)
+        bar.update(count)
         if run.out_of_time():
             return run.stop()
     bar.close()
@@ -113,10 +113,12 @@ def main(cfg):
         lengths = join(run, name, [part for job, part in zip(todo, parts) if job[0] == name])
         quartiles = np.percentile(lengths, [0, 25, 50, 75, 100])
         size = (run.dir / trajectories.files(name)[0]).stat().st_size / 2**20
-        print(f"{name}: {len(lengths):,} trajectories, {lengths.sum():,} steps, lengths {quartiles.astype(int)}, {size:,.0f} MiB")
+        print(f"{name}: {len(lengths):,} trajectories, {lengths.sum():,} steps, lengths {quartiles.astype(int)}, "
+              f"{size:,.0f} MiB")
     plots.checkpoints(run.rows(), run.dir / "success.png")
     rate = sum(job[2] for job in todo) / run.minutes() / 60
-    print(f"{run.dir}: {rate:,.0f} trajectories/s; success of the checkpoints " + " ".join(f"{np.mean(s):.0%}" for s in success))
+    rates = " ".join(f"{np.mean(ended):.0%}" for ended in success)
+    print(f"{run.dir}: {rate:,.0f} trajectories/s; success of the checkpoints {rates}")
     run.finish([file for name in SETS for file in trajectories.files(name)])
     for part in parts:
         part.unlink()

@@ -14,7 +14,7 @@ from functools import cache, partial
 import numpy as np
 import torch
 
-from common import artifacts, film, geometry, networks, plots, ppo, stacks, tables, task, trajectories
+from common import artifacts, episodes, film, geometry, networks, plots, stacks, tables, task, trajectories
 
 ESTIMATORS = ("vision", "mse", "likelihood", "ours")
 METHODS = tuple(stacks.ESTIMATOR)
@@ -100,7 +100,7 @@ class Players:
         estimator = self.estimator(stacks.ESTIMATOR[m.method])
         env = stacks.make(m.method, self.cfg.num_envs, estimator, self.cfg.passes, m.occlusion, m.whole_workspace)
         env = film.Recorded(env)
-        return *ppo.play(env, self.policy(m.method, m.seed), seed, m.greedy), env
+        return *episodes.play(env, self.policy(m.method, m.seed), seed, m.greedy), env
 
     def measure(self, m, bar, name):
         """One number an episode: 1 for success, or its contact switches."""
@@ -180,9 +180,9 @@ def main(cfg):
         return run.skip()
 
     players, done, todo = Players(cfg, paths, device), run.load_resume() or {}, measurements(cfg, seeds)
-    episodes = {name: m.episodes for name, m in todo.items()}
-    bar = artifacts.bar(sum(episodes.values()), "05_evaluate", unit="episode",
-                        initial=sum(n for name, n in episodes.items() if name in done))
+    counts = {name: m.episodes for name, m in todo.items()}
+    bar = artifacts.bar(sum(counts.values()), "05_evaluate", unit="episode",
+                        initial=sum(n for name, n in counts.items() if name in done))
     jobs = {f"estimator_ablation/{kind}": partial(estimator_errors, cfg, players, test, kind) for kind in ESTIMATORS}
     jobs |= {name: partial(players.measure, m, bar, name) for name, m in todo.items()}
     for name, job in jobs.items():

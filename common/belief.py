@@ -3,7 +3,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from common.networks import autocast, forget
+from common.networks import autocast
 
 
 class Believed(gym.vector.VectorWrapper):

@@ -17,7 +17,8 @@ class ObservationModel:
         num: number of worlds or trajectories.
         seed: of the draws. Each `step` takes the same number of draws from its own stream, whatever the states are: runs
             with the same seed see the same noise and occlusions at the same step, up to their first `reset`.
-        occlusion: duration in s of every occlusion; 0 for none, math.inf for "until the end", None for the paper's N(10, 5^2).
+        occlusion: duration in s of every occlusion; 0 for none, math.inf for "until the end", None for the paper's
+            N(10, 5^2).
     """
 
     def __init__(self, num, seed=0, occlusion=None):

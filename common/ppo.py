@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from common import artifacts, task
-from common.networks import autocast, forget, log_prob, log_softmax, mode, sample
+from common import artifacts, episodes
+from common.networks import autocast, forget, log_prob, log_softmax, sample
 
 
 @dataclass
@@ -134,7 +134,7 @@ def pad(x, position, sequence, length=None):
 
 
 def gae(reward, value, next_value, terminated, done, gamma, lam):
-    """Generalised advantages (T, N). A time limit bootstraps from the value of the final observation; a termination does not."""
+    """Generalised advantages (T, N). A time limit bootstraps from the final observation's value; a termination does not."""
     # TD error: r_t + gamma * V(s_{t+1}) - V(s_t)
     delta = reward + gamma * next_value * ~terminated - value
     advantage = torch.zeros_like(delta)
@@ -187,7 +187,7 @@ def _mean(x, mask):
 
 
 def policy_loss(actor, seq, cols, hp):
-    """Clipped surrogate with entropy bonus, averaged over valid steps; and entropy, KL from the old policy, max |ratio - 1|."""
+    """Clipped surrogate with entropy bonus over valid steps; and entropy, KL from the old policy, max |ratio - 1|."""
     mask, obs, actions, old, advantage = _columns(seq, cols, "obs", "actions", "logp", "advantage")
     with autocast(obs.device):
         logits = actor(obs, tuple(h[:, cols] for h in seq["hidden_pi"]))[0]
@@ -209,8 +209,10 @@ def value_loss(critic, seq, cols, hp):
 
 
 def _descend(net, optimizer, loss, seq, batches, hp):
-    """One step of Adam a mini-batch; what else the loss returned, stacked (mini-batches, ...). Gradients are clipped per net:
-    together the value's would drown the policy's."""
+    """One step of Adam a mini-batch; what else the loss returned, stacked (mini-batches, ...).
+
+    Gradients are clipped per net: together the value's would drown the policy's.
+    """
     told = []
     for cols in batches:
         value, more = loss(net, seq, cols, hp)
@@ -244,37 +246,8 @@ def update(actor, critic, optimizers, seq, hp):
     lr = max(hp.lr_min, lr / 1.5) if kl > 2 * hp.kl_target else min(hp.lr_max, lr * 1.5) if kl < hp.kl_target / 2 else lr
     for optimizer in optimizers:
         optimizer.param_groups[0]["lr"] = lr
-    return {"kl": kl, "entropy": entropy, "value_loss": told[1][-last:].mean().item(), "ratio": told[0][0, 2].item(), "lr": lr}
-
-
-@torch.no_grad()
-def play(env, actor, seed, greedy=True, record=None):
-    """Plays one whole episode in every world: the first after `reset(seed)`.
-
-    Args:
-        actor: policy net on the env's observations.
-        greedy: the mode of each categorical, else a sample.
-        record: called as record(t, obs, env, running) before each action.
-    Returns:
-        success (N,) bool and length (N,) in steps.
-    """
-    device = next(actor.parameters()).device
-    obs, _ = env.reset(seed=seed)
-    running, success = np.ones(len(obs), bool), np.zeros(len(obs), bool)
-    length, hidden = np.zeros(len(obs), int), None
-    for t in range(task.HORIZON):
-        if record:
-            record(t, obs, env, running)
-        with autocast(device):
-            logits, hidden = actor(torch.as_tensor(obs, device=device)[None], hidden)
-        action = (mode if greedy else sample)(logits[0])
-        obs, _, terminated, truncated, infos = env.step(action.cpu().numpy())
-        length += running
-        success |= running & infos["success"]
-        running &= ~(terminated | truncated)
-        if not running.any():
-            break
-    return success, length
+    return {"kl": kl, "entropy": entropy, "value_loss": told[1][-last:].mean().item(), "ratio": told[0][0, 2].item(),
+            "lr": lr}
 
 
 def train(run, hp, make_env, actor, critic, keep=None):
@@ -294,12 +267,12 @@ def train(run, hp, make_env, actor, critic, keep=None):
     aids = env.unwrapped
     aids.tolerance, aids.near_share = hp.tolerance, hp.near_share
     optimizers = [torch.optim.Adam(net.parameters(), lr=hp.lr, eps=1e-5) for net in (actor, critic)]
-    first, episodes, successes = 0, 0, 0
+    first, ended, successes = 0, 0, 0
     if state := run.load_resume():
         actor.load_state_dict(state["actor"]), critic.load_state_dict(state["critic"])
         for optimizer, saved in zip(optimizers, state["optimizers"]):
             optimizer.load_state_dict(saved)
-        first, episodes, successes, aids.tolerance = (state[k] for k in ("update", "episodes", "successes", "tolerance"))
+        first, ended, successes, aids.tolerance = (state[k] for k in ("update", "episodes", "successes", "tolerance"))
     bar = artifacts.bar(hp.updates, run.dir.parent.name, initial=first, unit="update")
     clock, played, stats = time.perf_counter(), 0, dict.fromkeys(STATS, float("nan"))
     for k in range(first, hp.updates + 1):
@@ -308,7 +281,7 @@ def train(run, hp, make_env, actor, critic, keep=None):
         if (k % hp.eval_every == 0 or k == hp.updates) and (k > first or not k):
             with torch.random.fork_rng():
                 torch.manual_seed(hp.seed)
-                success = play(held_out, actor, seed=10**6 + hp.seed)[0].mean()
+                success = episodes.play(held_out, actor, seed=10**6 + hp.seed)[0].mean()
             rate, clock, played = played / max(time.perf_counter() - clock, 1e-9), time.perf_counter(), 0
             row = dict(update=k, steps=k * hp.num_envs * hp.rollout_steps, success=success, tolerance=aids.tolerance)
             run.log(**row, **stats, steps_per_s=rate)
@@ -317,9 +290,9 @@ def train(run, hp, make_env, actor, critic, keep=None):
             break
         if k % hp.resume_every == 0:  # all worlds start anew here, in an uninterrupted run too
             if k > first:
-                run.save_resume(dict(update=k, actor=actor.state_dict(), critic=critic.state_dict(), tolerance=aids.tolerance,
+                run.save_resume(dict(update=k, actor=actor.state_dict(), critic=critic.state_dict(),
                                      optimizers=[optimizer.state_dict() for optimizer in optimizers],
-                                     episodes=episodes, successes=successes))
+                                     tolerance=aids.tolerance, episodes=ended, successes=successes))
                 if run.out_of_time():
                     run.stop()
                     return False
@@ -330,11 +303,11 @@ def train(run, hp, make_env, actor, critic, keep=None):
         batch, carry = rollout(env, actor, critic, carry, hp.rollout_steps)
         seq = sequences(batch, critic, hp.gamma, hp.lam)
         stats = update(actor, critic, optimizers, seq, hp) | {"explained": seq["explained"]}
-        episodes, successes = episodes + batch["success"][0], successes + batch["success"][1]
-        if episodes >= 512:
-            if successes > 0.6 * episodes:
+        ended, successes = ended + batch["success"][0], successes + batch["success"][1]
+        if ended >= 512:
+            if successes > 0.6 * ended:
                 aids.tolerance = max(1.0, 0.95 * aids.tolerance)
-            episodes = successes = 0
+            ended = successes = 0
         played += hp.num_envs * hp.rollout_steps
         bar.update()
     return True

@@ -21,7 +21,7 @@ def mirror(obs, sign):
 
 
 class Mirrored(gym.vector.VectorWrapper):
-    """The topmost wrapper of a policy's stack: observations, final_obs and actions in the frame of `signs` of each episode."""
+    """Topmost wrapper of a policy's stack: observations, final_obs and actions in each episode's frame, that of `signs`."""
 
     def reset(self, *, seed=None, options=None):
         obs, infos = self.env.reset(seed=seed, options=options)

@@ -77,7 +77,7 @@ def outside(box, pusher):
 
 
 def reward(box, velocity, success, out):
-    """r = r_term + k1 (1 - d_trans) + k2 (1 - d_rot) + k3 (1 - v_p) (sec. 4) for poses (N, 3) and pusher velocities (N, 2)."""
+    """r = r_term + k1 (1 - d_trans) + k2 (1 - d_rot) + k3 (1 - v_p) (sec. 4) of poses (N, 3), pusher velocities (N, 2)."""
     d_trans = np.linalg.norm(box[:, :2], axis=1) / np.linalg.norm(WORKSPACE)
     d_rot = np.abs(wrap(box[:, 2])) / np.pi
     v_p = np.linalg.norm(velocity, axis=1) / (MAX_SPEED * np.sqrt(2))

@@ -7,7 +7,9 @@ from common.observation import ObservationModel
 
 
 def load(states_path, offsets_path):
-    """Trajectories as (states (steps, 7) float32, memory-mapped; offsets (n + 1,)): the i-th is states[offsets[i]:offsets[i + 1]].
+    """Trajectories as states (steps, 7) float32, memory-mapped, and offsets (n + 1,).
+
+    The i-th trajectory is states[offsets[i]:offsets[i + 1]].
 
     Raises:
         artifacts.UserError: the two files do not belong together, or are damaged.

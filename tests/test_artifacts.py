@@ -201,7 +201,8 @@ def test_a_changed_input_makes_every_later_stage_stale(config):
         with pytest.raises(UserError, match="02_b/seed0 is stale, its input 01_a/seed0/p.* python 02_b.py quick .*--force"):
             find(cfg, stage, name, method)
     make(redo, "02_b", "q.safetensors", 2, a)
-    with pytest.raises(UserError, match="03_c/ours/seed0 is stale, its input 02_b/seed0/q.* python 03_c.py quick --method ours"):
+    words = "03_c/ours/seed0 is stale, its input 02_b/seed0/q.* python 03_c.py quick --method ours"
+    with pytest.raises(UserError, match=words):
         find(cfg, "03_c", "r.safetensors", method="ours")
 
 
@@ -229,8 +230,9 @@ if __name__ == "__main__":
 @pytest.fixture
 def command(tmp_path):
     (tmp_path / "07_x.py").write_text(SCRIPT)
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
     return lambda *args: subprocess.run(
-        [sys.executable, "07_x.py", *args], cwd=tmp_path, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)}
+        [sys.executable, "07_x.py", *args], cwd=tmp_path, capture_output=True, text=True, env=env
     )
 
 
@@ -259,7 +261,11 @@ def test_what_stops_a_stage_is_one_line(monkeypatch, capsys, tmp_path):
 
     full = OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr(sys, "argv", ["07_x.py", "--out", str(tmp_path / "file")])
-    for run, code, words in (begin, 2, "Not a directory"), (fails(full), 2, "No space"), (fails(KeyboardInterrupt), 130, "goes on"):
+    for run, code, words in [
+        (begin, 2, "Not a directory"),
+        (fails(full), 2, "No space"),
+        (fails(KeyboardInterrupt), 130, "goes on"),
+    ]:
         with pytest.raises(SystemExit) as end:
             artifacts.main(Config, {"quick": {}}, run, "doc")
         line = capsys.readouterr().err
@@ -271,7 +277,8 @@ def test_what_stops_a_stage_is_one_line(monkeypatch, capsys, tmp_path):
 def test_help_shows_the_fields_and_the_preset_s_values(command):
     end = command("smoke", "--help")
     assert end.returncode == 0 and not end.stderr
-    for words in "python 07_x.py [smoke|quick|paper]", "Trains nothing.", "--rate", "step size (default: 3.0)", "--max-minutes":
+    usage = "python 07_x.py [smoke|quick|paper]"
+    for words in usage, "Trains nothing.", "--rate", "step size (default: 3.0)", "--max-minutes":
         assert words in end.stdout
     assert "--preset" not in end.stdout
 
@@ -281,7 +288,8 @@ def test_presets():
     assert (parse().preset, parse().rate) == ("quick", 2.0)
     assert (parse("paper").preset, parse("paper").rate) == ("paper", 0.001)
     assert parse("paper", "--rate", "5", "--widths", "1", "2", "--max-minutes", "2").widths == (1, 2)
-    for wrong in ["--seed", "-1"], ["--device", "tpu"], ["--rate"], ["--preset", "paper"], ["--seed", "1.5"], ["--force", "yes"]:
+    for wrong in [["--seed", "-1"], ["--device", "tpu"], ["--rate"], ["--preset", "paper"], ["--seed", "1.5"],
+                  ["--force", "yes"]]:
         with pytest.raises(UserError, match=wrong[-1] if wrong[0] != "--rate" else "--rate"):
             parse(*wrong)
 

@@ -8,7 +8,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from common import geometry, task
-from common.env import SUB_STEPS, PushEnv, PushVectorEnv
+from common.env import PushEnv, PushVectorEnv
+from common.simulator import SUB_STEPS
 
 C = task.LIMIT_SURFACE_C
 G = task.GRAVITY
@@ -38,7 +39,8 @@ def play(env, action, steps):
 
 
 def launch(env, velocity, omega=0.0):
-    for body, v, w in zip(env._boxes, np.broadcast_to(velocity, (env.num_envs, 2)), np.broadcast_to(omega, env.num_envs)):
+    velocity, omega = np.broadcast_to(velocity, (env.num_envs, 2)), np.broadcast_to(omega, env.num_envs)
+    for body, v, w in zip(env.worlds.bodies, velocity, omega):
         body.velocity, body.angular_velocity = tuple(v), w
 
 
@@ -110,7 +112,7 @@ def test_static_friction_holds_up_to_its_limit(angle):
     for pull, moves in (0.98, False), (1.02, True):
         for i in range(3):
             env = start(box=[0, 0, 0.5], mu_static=mu[i])
-            env.space.gravity = tuple(pull * mu[i] * G * np.array([np.cos(angle), np.sin(angle)]))
+            env.worlds.space.gravity = tuple(pull * mu[i] * G * np.array([np.cos(angle), np.sin(angle)]))
             play(env, REST, 15)
             travel = env.box[0] - [0, 0, 0.5]
             assert (np.linalg.norm(travel[:2]) > 0.01) == moves
@@ -119,7 +121,7 @@ def test_static_friction_holds_up_to_its_limit(angle):
 
 def test_sliding_box_brakes_by_what_friction_leaves_of_a_slope_and_then_holds():
     env = start(mu_dynamic=0.2)
-    env.space.gravity = (0.1 * G, 0)
+    env.worlds.space.gravity = (0.1 * G, 0)
     launch(env, (0.5, 0))
     states = play(env, REST, 30)
     assert env.box[0, 0] == pytest.approx(0.5**2 / (2 * 0.1 * G), rel=0.03)
@@ -203,7 +205,7 @@ def test_force_is_the_impulse_of_the_whole_control_step(restitution):
     gap = np.linspace(0.0002, 0.003, 15)
     env = start(15, pusher=west(np.zeros(15), gap), mu_static=0, mu_dynamic=0, restitution=restitution)
     force = play(env, [10, REST], 3)[..., 5]
-    velocity = np.array([body.velocity.x for body in env._boxes])
+    velocity = np.array([body.velocity.x for body in env.worlds.bodies])
     assert velocity == pytest.approx(0.05 * (1 + restitution), rel=1e-6)
     assert force.sum(0) / task.RATE == pytest.approx(-3.25 * velocity, rel=1e-6)
 

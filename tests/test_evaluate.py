@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from common import film, networks, plots, ppo, stacks, tables, task
+from common import film, networks, plots, stacks, tables, task
 
 evaluate = importlib.import_module("05_evaluate")
 
@@ -191,7 +191,8 @@ def test_every_figure_is_drawn_with_whatever_runs_there_are(tmp_path, short):
     results = tables.summarise(made_up())
     plots.occlusion_duration(results["occlusion_duration"], tmp_path / "occlusion_duration.png")
     plots.sim(tmp_path / "sim.png")
-    pair = {m: play.episode(evaluate.Measurement(m, 6, occlusion=math.inf), 1) for m in ("est_uncertainty", "priv_on_estimate")}
+    pair = {m: play.episode(evaluate.Measurement(m, 6, occlusion=math.inf), 1)
+            for m in ("est_uncertainty", "priv_on_estimate")}
     plots.trajectory_with_uncertainty(pair, tmp_path / "trajectory.png", 3, 6, 1)
     images = sorted(tmp_path.glob("*.png"))
     assert len(images) == 11 and all(min(shape(path)[:2]) >= 350 for path in images)
