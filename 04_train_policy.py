@@ -12,7 +12,7 @@ from typing import Literal
 
 import torch
 
-from common import artifacts, networks, plots, ppo, stacks, supervised, symmetry, trajectories
+from common import artifacts, networks, plots, ppo, stacks, supervised, trajectories
 
 METHODS = ("est_uncertainty", "est", "est_mse", "end_to_end", "behavior_cloning")
 
@@ -91,10 +91,8 @@ def train_bc(run, cfg, paths, device):
     student = networks.policy(9, cfg.sizes).to(device)
 
     def loss(data, index, seed):
-        """Sum over both velocities of the cross-entropy with the teacher's distribution, in the mirrored frame of both."""
-        o, s, mask = (x.cpu().numpy() for x in trajectories.observe(data, index, seed, device))
-        sign = symmetry.signs(s[0])
-        o, s, mask = (torch.as_tensor(x, device=device) for x in (symmetry.mirror(o, sign), symmetry.mirror(s, sign), mask))
+        """Sum over both velocities of the cross-entropy with the teacher's distribution."""
+        o, s, mask = trajectories.observe(data, index, seed, device)
         with networks.autocast(device):
             with torch.no_grad():
                 target = networks.log_softmax(teacher(s)[0]).exp()

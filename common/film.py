@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image
 
-from common import env, task
+from common import env, symmetry, task
 from common.artifacts import write_atomic
 from common.plots import corners
 
@@ -35,8 +35,11 @@ class Recorded(gym.vector.VectorWrapper):
         self.rows.append({name: x.astype(np.float32) for name, x in row.items()})
 
     def episode(self, world, length):
-        """Arrays (length + 1, ...) of a world's first episode, its last state included."""
-        return {name: np.stack([row[name][world] for row in self.rows[:length + 1]]) for name in self.rows[0]}
+        """Arrays (length + 1, ...) of a world's first episode, its last state included, in the frame of the world."""
+        kept = {name: np.stack([row[name][world] for row in self.rows[:length + 1]]) for name in self.rows[0]}
+        if "belief" in kept:
+            kept["belief"] = symmetry.mirror(kept["belief"], symmetry.signs(kept["o"][:1]))
+        return kept
 
 
 def pixels(points):

@@ -19,8 +19,7 @@ def make(method, num_envs, estimator=None, passes=1, occlusion=None, whole_works
         whole_workspace: starts over the whole workspace.
     """
     env = PushVectorEnv(num_envs, whole_workspace=whole_workspace)
-    if method != "priv_on_state":
-        env = Observed(env, occlusion)
+    env = Mirrored(env if method == "priv_on_state" else Observed(env, occlusion))
     if ESTIMATOR[method]:
         env = Believed(env, estimator, passes, sigma=method == "est_uncertainty")
-    return Mirrored(env)
+    return env

@@ -1,4 +1,4 @@
-"""The task's two mirror symmetries: a policy only ever sees the quarter of the workspace in which its episode began."""
+"""The task's two mirror symmetries: nets only ever see the quarter of the workspace in which their episode began."""
 import gymnasium as gym
 import numpy as np
 
@@ -21,7 +21,7 @@ def mirror(obs, sign):
 
 
 class Mirrored(gym.vector.VectorWrapper):
-    """Topmost wrapper of a policy's stack: observations, final_obs and actions in each episode's frame, that of `signs`."""
+    """What is seen, and the actions, in the frame of each episode's first observation (`signs`); final_obs in the ended one's."""
 
     def reset(self, *, seed=None, options=None):
         obs, infos = self.env.reset(seed=seed, options=options)

@@ -2,7 +2,7 @@
 import numpy as np
 import torch
 
-from common import artifacts, task
+from common import artifacts, symmetry, task
 from common.observation import ObservationModel
 
 
@@ -55,10 +55,15 @@ def subset(data, count):
 
 
 def observe(data, index, seed, device, occlusion=None):
-    """Batch with fresh noise and occlusions: o (T, B, 9), scaled true states (T, B, 8), mask (T, B), on the device."""
+    """Batch with fresh noise and occlusions: o (T, B, 9), scaled true states (T, B, 8), mask (T, B), on the device.
+
+    Both are in the mirrored frame of the first observation, as in the running stacks.
+    """
     states, mask = padded(data, index)
     o = ObservationModel(len(index), seed, occlusion).trajectory(states)
-    return tuple(torch.as_tensor(x, device=device) for x in (o, task.scale(states), mask))
+    sign = symmetry.signs(o[0])
+    o, s = symmetry.mirror(o, sign), symmetry.mirror(task.scale(states), sign)
+    return tuple(torch.as_tensor(x, device=device) for x in (o, s, mask))
 
 
 def pose_errors(q_hat, q, occluded, mask):
