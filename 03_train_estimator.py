@@ -25,8 +25,6 @@ class Config(artifacts.Stage):
     """LSTM and two linear layers (sec. 4)"""
     dropout: float = 0.2
     """probability before every linear layer, of ours (sec. 4)"""
-    residual: bool = False
-    """aid: the pose heads predict the difference from the observed pose, which a short training cannot learn to copy"""
     sequences: int = 100
     """trajectories per mini-batch: 30,000 steps in sequences of 300, padded (tab. estimator_hyperparameters)"""
     epochs: int = 110
@@ -42,9 +40,9 @@ class Config(artifacts.Stage):
 
 
 PRESETS = {
-    "smoke": dict(residual=True, sizes=(16, 16, 16), sequences=16, epochs=2, validation=12),
-    "quick": dict(residual=True, sizes=(256, 128, 64), sequences=50, epochs=5, lr_end=5e-5, validation=500),
-    "laptop": dict(residual=True, sizes=(512, 256, 128), sequences=64, epochs=20, lr_end=5e-5, validation=1000),
+    "smoke": dict(sizes=(16, 16, 16), sequences=16, epochs=2, validation=12),
+    "quick": dict(sizes=(256, 256, 256), sequences=25, epochs=4, lr=2e-3, lr_end=5e-5, validation=500),
+    "laptop": dict(sizes=(512, 512, 256), sequences=32, epochs=20, lr=2e-3, lr_end=5e-5, validation=1000),
     "paper": {},
 }
 
@@ -53,7 +51,7 @@ def train(run, cfg, train_set, validation_set, device):
     """f with eq. 1 or the mean squared error of one stochastic pass; False when the time limit stopped it."""
     torch.manual_seed(cfg.seed)
     dropout = cfg.dropout if cfg.method == "ours" else 0.0
-    f = networks.Estimator(cfg.sizes, dropout, cfg.method != "mse", cfg.residual).to(device)
+    f = networks.Estimator(cfg.sizes, dropout, cfg.method != "mse").to(device)
 
     def loss(data, index, seed):
         o, s, mask = trajectories.observe(data, index, seed, device)

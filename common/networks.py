@@ -104,38 +104,35 @@ class Estimator(nn.Module):
         sizes: of the LSTM and the two hidden linear layers.
         dropout: probability; 0 for the likelihood and MSE variants.
         likelihood: predict log-variances too (8 outputs), else the pose alone (4, MSE).
-        residual: predict the pose's difference from the one in o, not the pose.
     """
 
-    def __init__(self, sizes=(1024, 512, 256), dropout=0.2, likelihood=True, residual=False):
+    def __init__(self, sizes=(1024, 512, 256), dropout=0.2, likelihood=True):
         super().__init__()
-        self.sizes, self.dropout, self.likelihood, self.residual = tuple(sizes), dropout, likelihood, residual
+        self.sizes, self.dropout, self.likelihood = tuple(sizes), dropout, likelihood
         self.lstm = nn.LSTM(9, sizes[0])
         self.layers = nn.ModuleList([nn.Linear(sizes[0], sizes[1]), nn.Linear(sizes[1], sizes[2]),
                                      nn.Linear(sizes[2], 8 if likelihood else 4)])
 
-    def head(self, z, o):
+    def head(self, z):
         """Poses (..., 4) and log-variances (..., 4) or None of features (..., H), with a fresh dropout mask each call."""
         for i, layer in enumerate(self.layers):
             z = layer(dropout(z, self.dropout))  # at training and testing time
             if i < 2:
                 z = torch.tanh(z)
         q, log_var = z.float().split(4, -1) if self.likelihood else (z.float(), None)
-        if self.residual:
-            q = q + o[..., :4]
         return q, log_var.clamp(*LOG_VAR) if self.likelihood else None
 
     def forward(self, o, hidden=None):
         """One stochastic pass: pose (T, B, 4), log-variances and the hidden state of observations (T, B, 9)."""
         z, hidden = self.lstm(o, hidden)
-        return *self.head(z, o), hidden
+        return *self.head(z), hidden
 
     def predict(self, o, hidden=None, passes=50):
         """Predictive mean and total variance (T, B, 4) (eqs. 3, 4), and hidden state: LSTM once, head `passes` times."""
         z, hidden = self.lstm(o, hidden)
         passes = passes if self.dropout else 1
         at_once = max(1, 2**15 // (z.shape[0] * z.shape[1]))  # bounds the memory; a single world runs all passes at once
-        heads = [self.head(z.expand(min(at_once, passes - i), *z.shape), o) for i in range(0, passes, at_once)]
+        heads = [self.head(z.expand(min(at_once, passes - i), *z.shape)) for i in range(0, passes, at_once)]
         q, log_var = zip(*heads)
         return *predictive(torch.cat(q), torch.cat(log_var) if self.likelihood else None), hidden
 
@@ -170,8 +167,7 @@ def load_recurrent(path, device="cpu"):
 
 def save_estimator(path, net):
     """Writes an estimator as safetensors, with its sizes and kind."""
-    artifacts.save_tensors(path, net, sizes=net.sizes, dropout=net.dropout, likelihood=net.likelihood,
-                           residual=net.residual)
+    artifacts.save_tensors(path, net, sizes=net.sizes, dropout=net.dropout, likelihood=net.likelihood)
 
 
 def load_estimator(path, device="cpu"):

@@ -16,6 +16,8 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
         save: called after each epoch with the lowest validation loss so far.
         data, held_out: trajectories to train and to validate on.
         sequences, epochs, lr, lr_end, grad_norm, validation: as in the stages' Config.
+    Raises:
+        artifacts.UserError: the validation loss is not finite.
     Returns:
         True when trained to the end, False when the time limit stopped it.
     """
@@ -45,6 +47,8 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
             batches = trajectories.batches(trajectories.subset(held_out, validation), sequences)
             values, steps = zip(*(loss(held_out, index, (k,)) for k, index in enumerate(batches)))
         validation_loss = float(np.average([v.item() for v in values], weights=steps))
+        if not math.isfinite(validation_loss):
+            raise artifacts.UserError(f"{run.dir}: training diverged in epoch {epoch + 1}: use a lower rate, and --force")
         run.log(epoch=epoch + 1, train_loss=float(np.mean(losses)), validation_loss=validation_loss)
         if validation_loss < best:
             best = validation_loss

@@ -87,7 +87,7 @@ def test_every_step_and_pass_has_its_own_mask():
     f = small(dropout=0.5)
     nn.init.zeros_(f.lstm.weight_ih_l0), nn.init.zeros_(f.lstm.weight_hh_l0)
     z = f.lstm(torch.zeros(30, 1, 9))[0][-1:, :1]
-    q, _ = f.head(z.expand(20, 4, 5, 16), INPUTS[0, 0])  # the same features at 20 passes, 4 steps, 5 worlds
+    q, _ = f.head(z.expand(20, 4, 5, 16))  # the same features at 20 passes, 4 steps, 5 worlds
     assert len(q.reshape(-1, 4).unique(dim=0)) == 20 * 4 * 5
 
 
@@ -123,17 +123,7 @@ def test_without_dropout_the_head_is_tanh_layers():
     f = small(dropout=0.0)
     a, b, c = f.layers
     z = torch.randn(3, 2, 16)
-    torch.testing.assert_close(torch.cat(f.head(z, None), -1), c(torch.tanh(b(torch.tanh(a(z))))))
-
-
-def test_a_residual_estimator_adds_the_observed_pose():
-    plain = small(dropout=0.0)
-    residual = networks.Estimator(plain.sizes, 0.0, residual=True)
-    residual.load_state_dict(plain.state_dict())
-    (q, log_var, _), (q_hat, log_var_hat, _) = plain(INPUTS), residual(INPUTS)
-    torch.testing.assert_close(q_hat, q + INPUTS[..., :4])
-    assert log_var_hat.equal(log_var)
-    torch.testing.assert_close(residual.predict(INPUTS, passes=3)[0], q_hat)
+    torch.testing.assert_close(torch.cat(f.head(z), -1), c(torch.tanh(b(torch.tanh(a(z))))))
 
 
 def test_log_variances_are_clamped():
