@@ -41,7 +41,7 @@ class Config(artifacts.Stage):
 
 PRESETS = {
     "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, passes=2, test=12, num_envs=16),
-    "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, passes=10, test=2000, num_envs=300),
+    "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, passes=20, test=2000, num_envs=300),
     "laptop": dict(switch_episodes=2000, passes=10, test=6000, num_envs=1000),
     "paper": {},
 }
