@@ -6,6 +6,7 @@ Reads the checkpoints of 01. Writes runs/<preset>/02_collect/seed<k>/: for the s
 the same number of whole episodes each) and teacher_train, teacher_validation (the last checkpoint) <set>_states.npy
 (steps, 7) float32 in SI units and <set>_offsets.npy (n + 1,); metrics.csv and success.png of the checkpoints.
 """
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,17 +82,23 @@ def join(run, name, parts):
     return lengths
 
 
+def remove_parts(run):
+    for part in run.dir.glob("part_*.npz"):
+        part.unlink()
+
+
 def main(cfg):
     folder = artifacts.find(cfg, "01_train_privileged", "policy.safetensors").parent
     names = [name for name in artifacts.record_of(cfg, folder)["outputs"] if name.startswith("checkpoint_")]
     paths = [artifacts.find(cfg, "01_train_privileged", name) for name in sorted(names)]
     run = artifacts.Run(cfg, "02_collect", {p.name: p for p in paths})
     if run.skip():
-        return
+        return remove_parts(run)
     device = artifacts.device_of(cfg)
     todo = list(jobs(cfg, len(paths)))
     parts = [run.dir / f"part_{k:05d}.npz" for k in range(len(todo))]
     left = [k for k, part in enumerate(parts) if not part.exists()]
+    clock = time.perf_counter()
     bar = artifacts.bar(sum(todo[k][2] for k in left), "02_collect", unit="trajectory")
     for k in left:
         name, player, count = todo[k]
@@ -102,6 +109,7 @@ def main(cfg):
         bar.update(count)
         if run.out_of_time():
             return run.stop()
+    rate = sum(todo[k][2] for k in left) / (time.perf_counter() - clock)
     bar.close()
 
     success = [[] for _ in paths]
@@ -116,12 +124,10 @@ def main(cfg):
         print(f"{name}: {len(lengths):,} trajectories, {lengths.sum():,} steps, lengths {quartiles.astype(int)}, "
               f"{size:,.0f} MiB")
     plots.checkpoints(run.rows(), run.dir / "success.png")
-    rate = sum(job[2] for job in todo) / run.minutes() / 60
     rates = " ".join(f"{np.mean(ended):.0%}" for ended in success)
     print(f"{run.dir}: {rate:,.0f} trajectories/s; success of the checkpoints {rates}")
     run.finish([file for name in SETS for file in trajectories.files(name)])
-    for part in parts:
-        part.unlink()
+    remove_parts(run)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from typing import Literal
 
 import torch
 
-from common import artifacts, networks, plots, ppo, stacks, supervised, trajectories
+from common import artifacts, networks, plots, ppo, stacks, supervised, symmetry, trajectories
 
 METHODS = ("est_uncertainty", "est", "est_mse", "end_to_end", "behavior_cloning")
 
@@ -52,9 +52,12 @@ PRESETS = {
 
 def inputs_of(cfg):
     """Paths of what a method reads."""
-    paths = {name: artifacts.find(cfg, "01_train_privileged", f"{name}.safetensors") for name in ("policy", "value")}
+    def nets(*names):
+        return {name: artifacts.find(cfg, "01_train_privileged", f"{name}.safetensors") for name in names}
+
     if cfg.method == "behavior_cloning":
-        return paths | trajectories.load_set(cfg, "teacher_train")[1] | trajectories.load_set(cfg, "teacher_validation")[1]
+        return nets("policy") | trajectories.load_set(cfg, "teacher_train")[1] | trajectories.load_set(cfg, "teacher_validation")[1]
+    paths = nets("policy", "value") if cfg.warm_start else {}
     if kind := stacks.ESTIMATOR[cfg.method]:
         paths["estimator"] = artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", kind)
     return paths
@@ -62,6 +65,8 @@ def inputs_of(cfg):
 
 def start_from(net, trained):
     """Copies pi_priv's (or its value net's) weights into a net with further inputs, whose weights become zero."""
+    if net.sizes != tuple(trained.sizes):
+        raise artifacts.UserError(f"--sizes {net.sizes}: pi_priv has {tuple(trained.sizes)}; use those, or --no-warm-start")
     weights = trained.state_dict()
     wide = torch.zeros_like(net.encoder.weight)
     wide[:, :trained.inputs] = weights["encoder.weight"]
@@ -93,9 +98,13 @@ def train_bc(run, cfg, paths, device):
     def loss(data, index, seed):
         """Sum over both velocities of the cross-entropy with the teacher's distribution."""
         o, s, mask = trajectories.observe(data, index, seed, device)
+        off = symmetry.signs(s[0].cpu().numpy())  # the teacher acted in the frame of the true start
+        s_teacher = torch.as_tensor(symmetry.mirror(s.cpu().numpy(), off), device=device)
+        flipped = torch.as_tensor(off < 0, device=device)[None, :, :, None]
         with networks.autocast(device):
             with torch.no_grad():
-                target = networks.log_softmax(teacher(s)[0]).exp()
+                target = networks.log_softmax(teacher(s_teacher)[0]).exp()
+            target = torch.where(flipped, target.flip(-1), target)
             logp = networks.log_softmax(student(o)[0])
         steps = mask.sum()
         return (-(target * logp).sum((-1, -2)) * mask).sum() / steps, steps.item()

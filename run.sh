@@ -3,17 +3,22 @@
 # ./run.sh test                         the tests
 set -euo pipefail
 cd "$(dirname "$0")"
+what=${1:-quick}
+case $what in smoke|quick|laptop|paper|test) ;; *) echo "error: $what: say smoke, quick, laptop, paper or test" >&2; exit 2 ;; esac
+[ $# -le 1 ] || { echo "error: one word only; for settings run the scripts by hand (see README.md)" >&2; exit 2; }
 
-python=$(command -v python3.11 || command -v python3) || { echo "error: python 3.11 is not on the PATH" >&2; exit 2; }
 if ! cmp -s requirements.txt .venv/installed.txt; then
+    python=$(command -v python3.11 || command -v python3 || true)
+    "${python:-false}" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
+        { echo "error: Python 3.11 or newer is not on the PATH" >&2; exit 2; }
     "$python" -m venv .venv
     .venv/bin/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
     cp requirements.txt .venv/installed.txt
 fi
 
-if [ "${1:-quick}" = test ]; then
-    exec .venv/bin/python -m pytest -q "${@:2}"
+if [ "$what" = test ]; then
+    exec .venv/bin/python -m pytest -q
 fi
 for script in 0*.py; do
-    .venv/bin/python "$script" "${1:-quick}"
+    .venv/bin/python "$script" "$what"
 done

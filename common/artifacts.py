@@ -25,6 +25,8 @@ import torch
 import tyro
 from tqdm import tqdm
 
+_STARTED = time.monotonic()
+
 
 class UserError(Exception):
     """A user's mistake: one line, what is wrong and what to do."""
@@ -66,8 +68,9 @@ def parse(config_class: type, presets: dict[str, dict], doc: str, args: list[str
         # tyro frames its message, with a rule below it and more help below that
         message = box.getvalue().partition("\n")[2].partition("│ ─")[0].replace("│", " ").strip().rstrip(".")
         raise UserError(f"{message}; see {script} {preset} --help") from None
-    if cfg.seed < 0:
-        raise UserError(f"--seed {cfg.seed}: a seed is 0 or more")
+    for name, value in vars(cfg).items():
+        if type(value) is int and value < (name != "seed"):
+            raise UserError(f"--{name.replace('_', '-')} {value}: at least {int(name != 'seed')}")
     return cfg
 
 
@@ -260,7 +263,8 @@ class Run:
         except Exception:  # whatever torch meets in a damaged file
             raise UserError(f"{path} is damaged: delete it, or use --force, to begin again") from None
         self.columns = next(csv.reader(lines), [])
-        write_atomic(metrics, lambda temporary: temporary.write_text("".join(lines)))
+        if lines:
+            write_atomic(metrics, lambda temporary: temporary.write_text("".join(lines)))
         return saved["state"]
 
     def minutes(self) -> float:
@@ -268,7 +272,7 @@ class Run:
         return self.minutes_before + (time.monotonic() - self.began) / 60
 
     def out_of_time(self) -> bool:
-        return (time.monotonic() - self.began) / 60 >= self.cfg.max_minutes
+        return (time.monotonic() - _STARTED) / 60 >= self.cfg.max_minutes  # of the command, whatever it runs in turn
 
     def stop(self):
         print(f"{self.dir}: stopped after {self.minutes():.1f} minutes; the same command, without --force, goes on")

@@ -11,10 +11,10 @@ class Believed(gym.vector.VectorWrapper):
 
     s_hat is (q_hat, pusher, noisy force) without xi; sigma the four standard deviations sqrt(diag Sigma) in scaled units,
     clipped to [0, 1] (appendix B.1). The estimator keeps a hidden state per world and forgets it at episode ends.
-    Infos: `belief` (N, 12), s_hat and sigma of this step; where an episode ended, of its end.
+    Infos: `belief` (N, 12), s_hat and sigma of this step in the frame of the env below; where an episode ended, of its end.
 
     Args:
-        env: an Observed env.
+        env: an Observed env, Mirrored.
         estimator: networks.Estimator.
         passes: M, the number of stochastic forward passes.
         sigma: append the standard deviations.

@@ -181,27 +181,31 @@ class PushEnv(gym.Env):
         return draw(self.vector.state[0])
 
 
+VIEW = 1.1 * task.WORKSPACE[0]  # m, the width of draw's picture
+_SQUARE = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+
+
+def corners(pose):
+    """Corners (4, 2) of the box at a pose (3,), m."""
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    return _SQUARE * task.BOX[:2] / 2 @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
+
+
 def draw(state, width=800):
     """Top view (width / 2, width, 3) uint8 of a state (7,): target light blue, box dark blue, pusher red (fig. sim)."""
     import cv2  # only pictures need it
     image = np.full((width // 2, width, 3), 255, np.uint8)
 
     def pixels(points):  # m to 1/16 pixel
-        points = np.atleast_2d(points) * [1, -1] * width / (task.WORKSPACE[0] * 1.1) + [width / 2, width / 4]
+        points = np.atleast_2d(points) * [1, -1] * width / VIEW + [width / 2, width / 4]
         return np.round(points * 16).astype(np.int32)
 
-    def corners(pose):
-        cos, sin = np.cos(pose[2]), np.sin(pose[2])
-        local = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * task.BOX[:2] / 2
-        return local @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
-
-    frame = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * task.HALF
-    cv2.polylines(image, [pixels(frame)], True, (150, 150, 150), 2, cv2.LINE_AA, 4)
+    cv2.polylines(image, [pixels(_SQUARE * task.HALF)], True, (150, 150, 150), 2, cv2.LINE_AA, 4)
     cv2.fillPoly(image, [pixels(corners(np.zeros(3)))], (170, 205, 240), cv2.LINE_AA, 4)
     cv2.fillPoly(image, [pixels(corners(state[:3]))], (30, 60, 130), cv2.LINE_AA, 4)
     front = state[:2] + np.array([np.cos(state[2]), np.sin(state[2])]) * task.BOX[0] / 2
     cv2.line(image, pixels(state[:2])[0].tolist(), pixels(front)[0].tolist(), (255, 255, 255), 2, cv2.LINE_AA, 4)
-    radius = int(task.RADIUS * width / (task.WORKSPACE[0] * 1.1) * 16)
+    radius = int(task.RADIUS * width / VIEW * 16)
     cv2.circle(image, pixels(state[3:5])[0].tolist(), radius, (210, 40, 40), -1, cv2.LINE_AA, 4)
     return image
 

@@ -5,11 +5,11 @@ import numpy as np
 from PIL import Image
 
 from common import env, symmetry, task
-from common.artifacts import write_atomic
-from common.plots import corners
+from common.artifacts import UserError, write_atomic
+from common.env import VIEW, corners
 
 WIDTH, HEIGHT = 960, 600  # pixels: the top view of env.draw, and 120 rows of text below
-SCALE = WIDTH / (1.1 * task.WORKSPACE[0])  # pixels per m, env.draw's
+SCALE = WIDTH / VIEW  # pixels per m
 HELD, ESTIMATE, FORCE, TEXT = (230, 159, 0), (0, 158, 115), (0, 0, 0), (60, 60, 60)  # RGB
 
 
@@ -87,7 +87,7 @@ def write(episode, mp4, gif):
     def video(path):
         writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), task.RATE, (WIDTH, HEIGHT))
         if not writer.isOpened():
-            raise OSError("opencv has no mp4 encoder")
+            raise UserError("this build of opencv has no mp4 encoder: install opencv-python-headless from requirements.txt")
         for image in frames:
             writer.write(image[..., ::-1])
         writer.release()

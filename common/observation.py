@@ -1,5 +1,4 @@
 """The observation model O of sec. 3.2: o = scale(clip(hold(s + bias + noise))) and the occlusion flag xi."""
-import math
 
 import gymnasium as gym
 import numpy as np

@@ -9,7 +9,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 
 from common import task
 from common.artifacts import write_atomic
-from common.env import PushEnv
+from common.env import PushEnv, corners
 
 matplotlib.use("Agg")
 matplotlib.rcParams.update({
@@ -124,7 +124,7 @@ def validation_loss(stage_dir, name, path):
 def success_rate(stage_dir, path, levels={}):
     """Fig. success_rate: held-out success over training; levels {method: rate} of methods without RL are dashed lines."""
     figure, ax = new(7, 3.6)
-    for i, method in enumerate(("est_uncertainty", "est", "est_mse", "end_to_end")):
+    for i, method in enumerate(METHODS):  # those with a curve: what PPO trained
         band(ax, stage_dir / method, "steps", "success", *METHODS[method][:2], 1e-6, 100, zorder=2.9 - i / 10)
     for method, level in levels.items():
         name, color, _ = METHODS[method]
@@ -151,13 +151,6 @@ def occlusion_duration(results, path):
     success_axis(ax)
     figure.legend(loc="outside right upper")
     save(figure, path)
-
-
-def corners(pose):
-    """Corners (4, 2) of the box at a pose (3,), m."""
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    local = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * task.BOX[:2] / 2
-    return local @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
 
 
 def trajectory_with_uncertainty(episodes, path, cases, count, index):

@@ -4,6 +4,7 @@ PPO sees only a vector env: every policy of the study is another stack of wrappe
 """
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -250,6 +251,18 @@ def update(actor, critic, optimizers, seq, hp):
             "lr": lr}
 
 
+@contextmanager
+def one_thread():
+    """Policy and value have a thread each; more within them would only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@one_thread()
 def train(run, hp, make_env, actor, critic, keep=None):
     """PPO from the last resume point to `hp.updates`; every `hp.eval_every` updates a row of metrics.
 
@@ -262,7 +275,6 @@ def train(run, hp, make_env, actor, critic, keep=None):
         True when trained to the end, False when the time limit stopped it.
     """
     device = next(actor.parameters()).device
-    torch.set_num_threads(1)  # policy and value have a thread each; more within them only wait for each other
     env, held_out = make_env(hp.num_envs), make_env(hp.eval_episodes)
     aids = env.unwrapped
     aids.tolerance, aids.near_share = hp.tolerance, hp.near_share
@@ -279,10 +291,11 @@ def train(run, hp, make_env, actor, critic, keep=None):
         if keep:
             keep(k, actor)
         if (k % hp.eval_every == 0 or k == hp.updates) and (k > first or not k):
+            rate = played / max(time.perf_counter() - clock, 1e-9)
             with torch.random.fork_rng():
                 torch.manual_seed(hp.seed)
                 success = episodes.play(held_out, actor, seed=10**6 + hp.seed)[0].mean()
-            rate, clock, played = played / max(time.perf_counter() - clock, 1e-9), time.perf_counter(), 0
+            clock, played = time.perf_counter(), 0
             row = dict(update=k, steps=k * hp.num_envs * hp.rollout_steps, success=success, tolerance=aids.tolerance)
             run.log(**row, **stats, steps_per_s=rate)
             bar.set_postfix_str(f"success {success:.1%}, tolerance {aids.tolerance:.2f}x, {rate:,.0f} steps/s")

@@ -2,7 +2,6 @@ import csv
 import importlib
 import json
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
