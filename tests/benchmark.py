@@ -40,8 +40,9 @@ def play(env, steps=10):
     return lambda: [env.step(actions[rng.integers(100)]) for _ in range(steps)], steps * env.num_envs
 
 
+@ppo.one_thread()
 def learn(what, preset, **changes):
-    """Rollout and update of pi_priv's nets."""
+    """Rollout and update of pi_priv's nets, with the threads of ppo.train."""
     stage = importlib.import_module("01_train_privileged")
     hp = stage.Config(**stage.PRESETS[preset] | changes)
     env = stacks.make("priv_on_state", hp.num_envs)
@@ -56,7 +57,12 @@ def learn(what, preset, **changes):
     def update():
         ppo.update(actor, critic, optimizers, ppo.sequences(batch, critic, hp.gamma, hp.lam), hp)
 
+    def both():
+        ppo.rollout(env, actor, critic, carry, hp.rollout_steps)
+        update()
+
     line(f"update, {what}, {hp.epochs} epochs, {hp.minibatch:,} a mini-batch", rate(update, steps, 3))
+    line(f"rollout and update, {what}", rate(both, steps, 3))
 
 
 def main():
