@@ -171,9 +171,10 @@ def draw(run, players, results, done):
 def main(cfg):
     device = artifacts.device_of(cfg)
     seeds = {m: finished_seeds(cfg, m) for m in METHODS}
-    paths = {(m, k): artifacts.find(cfg, *policy_of(m), k) for m in METHODS for k in seeds[m]}
-    paths |= {kind: artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", kind) for kind in ESTIMATORS[1:]}
+    artifacts.find(cfg, *policy_of("priv_on_state"))  # in the order of the stages: an error names the first that is missing
     test, test_paths = trajectories.load_set(cfg, "test")
+    paths = {kind: artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", kind) for kind in ESTIMATORS[1:]}
+    paths |= {(m, k): artifacts.find(cfg, *policy_of(m), k) for m in METHODS for k in seeds[m]}
     run = artifacts.Run(cfg, "05_evaluate", paths | test_paths)
     if run.finished:
         report(run)

@@ -83,6 +83,9 @@ def main(config_class: type, presets: dict[str, dict], run: Callable, doc: str):
         message, code = str(mistake), 2
     except KeyboardInterrupt:
         message, code = "interrupted: the same command, without --force, goes on from the last resume point", 130
+    except BrokenPipeError:  # `--help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
     except OSError as failure:
         # numpy gives no errno where the disk is full
         if failure.errno not in (None, errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EEXIST, errno.ENOTDIR):
