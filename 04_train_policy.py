@@ -56,7 +56,8 @@ def inputs_of(cfg):
         return {name: artifacts.find(cfg, "01_train_privileged", f"{name}.safetensors") for name in names}
 
     if cfg.method == "behavior_cloning":
-        return nets("policy") | trajectories.load_set(cfg, "teacher_train")[1] | trajectories.load_set(cfg, "teacher_validation")[1]
+        train, validation = (trajectories.load_set(cfg, f"teacher_{name}")[1] for name in ("train", "validation"))
+        return nets("policy") | train | validation
     paths = nets("policy", "value") if cfg.warm_start else {}
     if kind := stacks.ESTIMATOR[cfg.method]:
         paths["estimator"] = artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", kind)

@@ -21,7 +21,7 @@ def mirror(obs, sign):
 
 
 class Mirrored(gym.vector.VectorWrapper):
-    """What is seen, and the actions, in the frame of each episode's first observation (`signs`); final_obs in the ended one's."""
+    """What is seen, and the actions, in the frame of each episode's first observation (`signs`)."""
 
     def reset(self, *, seed=None, options=None):
         obs, infos = self.env.reset(seed=seed, options=options)

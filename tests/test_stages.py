@@ -256,7 +256,7 @@ def test_a_killed_run_ends_bit_for_bit_as_an_uninterrupted_one(study, tmp_path):
 
 
 @pytest.mark.parametrize("script, needed", [("02_collect", "01_train_privileged"), ("03_train_estimator", "02_collect"),
-                                            ("04_train_policy", "01_train_privileged"), ("05_evaluate", "04_train_policy")])
+                                            ("04_train_policy", "01_train_privileged"), ("05_evaluate", "01_train_privileged")])
 def test_a_missing_stage_is_named(tmp_path, call, script, needed):
     assert is_mistake(*call(tmp_path / "runs", script), f"run python {needed}.py smoke", "first")
 
