@@ -103,7 +103,7 @@ def main(cfg):
     for k in left:
         name, player, count = todo[k]
         policy = networks.load_recurrent(paths[player], device)
-        seed = int(np.random.SeedSequence([cfg.seed, k]).generate_state(1)[0])
+        seed = int(np.random.SeedSequence([cfg.seed, k, 1]).generate_state(1)[0])  # ppo.train has [seed, k]
         states, length, success = collect(policy, count, seed)
         artifacts.write_atomic(parts[k], lambda path: np.savez(path, states=states, length=length, success=success))
         bar.update(count)

@@ -41,7 +41,7 @@ class Config(artifacts.Stage):
 
 PRESETS = {
     "smoke": dict(sizes=(16, 16, 16), sequences=16, epochs=2, validation=12),
-    "quick": dict(sizes=(256, 256, 256), sequences=25, epochs=4, lr=2e-3, lr_end=5e-5, validation=500),
+    "quick": dict(sizes=(256, 256, 256), sequences=25, epochs=5, lr=2e-3, lr_end=5e-5, validation=500),
     "laptop": dict(sizes=(512, 512, 256), sequences=32, epochs=20, lr=2e-3, lr_end=5e-5, validation=1000),
     "paper": {},
 }

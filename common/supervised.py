@@ -35,7 +35,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
         for k, index in enumerate(trajectories.batches(rng.permutation(count), sequences)):
             progress = (epoch + k / updates) / epochs
             optimizer.param_groups[0]["lr"] = lr_end + (lr - lr_end) * (1 + math.cos(math.pi * progress)) / 2
-            value, _ = loss(data, index, (seed, epoch, k))
+            value, _ = loss(data, index, (seed, epoch, k, 1))  # the last number keeps apart what the seeds are for
             optimizer.zero_grad(set_to_none=True)
             value.backward()
             torch.nn.utils.clip_grad_norm_(net.parameters(), grad_norm)
@@ -45,7 +45,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
             bar.set_postfix_str(f"loss {losses[-1]:.3f}", refresh=False)
         with torch.no_grad():  # the same noise and occlusions every epoch
             batches = trajectories.batches(trajectories.subset(held_out, validation), sequences)
-            values, steps = zip(*(loss(held_out, index, (k,)) for k, index in enumerate(batches)))
+            values, steps = zip(*(loss(held_out, index, (0, 0, k, 2)) for k, index in enumerate(batches)))
         validation_loss = float(np.average([v.item() for v in values], weights=steps))
         if not math.isfinite(validation_loss):
             raise artifacts.UserError(f"{run.dir}: training diverged in epoch {epoch + 1}: use a lower rate, and --force")

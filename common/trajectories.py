@@ -99,7 +99,7 @@ def measure(data, count, size, seed, device, predict, occlusion=None):
     """Error table of predict(o) -> scaled poses (T, B, 4) over `count` trajectories, the same noise for every predict."""
     total = {}
     for k, index in enumerate(batches(subset(data, count), size)):
-        o, s, mask = observe(data, index, (seed, k), device, occlusion)
+        o, s, mask = observe(data, index, (seed, 0, k, 3), device, occlusion)
         for name, sums in pose_errors(predict(o), s[..., :4], o[..., 8], mask).items():
             total[name] = total.get(name, 0) + sums
     return error_table(total)
