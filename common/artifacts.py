@@ -18,7 +18,7 @@ import time
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Callable, Literal
+from typing import Callable, ClassVar, Literal
 
 import safetensors.torch
 import torch
@@ -36,6 +36,7 @@ class UserError(Exception):
 class Stage:
     """What every stage can be told. A script's Config adds its own fields, with the paper's values as defaults."""
 
+    free: ClassVar[tuple[str, ...]] = ()  # fields that may change from one call to the next of the same run
     preset: tyro.conf.Suppress[str] = "paper"
     seed: int = 0
     """seed of every random draw; names the run folder"""
@@ -198,12 +199,12 @@ class Run:
         self.cfg, self.dir = cfg, cfg.folder(stage, method, cfg.seed)
         self.began, self.minutes_before, self.logged, self.columns = time.monotonic(), 0.0, 0, []
         words = [re.sub(r"(^|=)[/~].*/(?=.)", r"\1", word) for word in sys.argv]  # absolute paths lose their folder
-        settings = {name: value for name, value in asdict(cfg).items() if name == "seed" or not hasattr(Stage, name)}
+        settings = {name: value for name, value in asdict(cfg).items() if name == "seed" or not hasattr(Stage, name) and name not in cfg.free}
         keys = (path.relative_to(cfg.out / cfg.preset).as_posix() for path in inputs.values())
         self.record = {
             "command": " ".join(["python", Path(words[0]).name, *words[1:]]),
             "versions": {"python": sys.version.split()[0]}
-            | {name: version(name) for name in ("torch", "numpy", "pymunk", "gymnasium")},
+            | {name: version(name) for name in ("torch", "numpy", "pymunk", "gymnasium", "opencv-python-headless", "clarabel")},
             "settings": json.loads(json.dumps(settings, default=str)),
             "inputs": {key: recorded(cfg, key)[2] for key in keys},
         }

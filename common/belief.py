@@ -6,11 +6,29 @@ import torch
 from common.networks import autocast
 
 
+@torch.no_grad()
+def believe(estimator, o, hidden, passes):
+    """One step of the estimator in the loop.
+
+    Args:
+        o: (N, 9) observations.
+        hidden: state of the LSTM, None at an episode's start.
+        passes: M, the number of stochastic forward passes.
+    Returns:
+        belief (N, 12): s_hat = (q_hat, pusher, noisy force) without xi, and the four standard deviations sqrt(diag Sigma)
+        in scaled units, clipped to [0, 1] (appendix B.1); and the next hidden state.
+    """
+    device = next(estimator.parameters()).device
+    with autocast(device):
+        q, variance, hidden = estimator.predict(torch.as_tensor(o, device=device)[None], hidden, passes)
+    sigma = variance[0].sqrt().clamp(max=1.0)
+    return np.concatenate([q[0].cpu().numpy(), o[:, 4:8], sigma.cpu().numpy()], 1), hidden
+
+
 class Believed(gym.vector.VectorWrapper):
     """An Observed env whose box pose is the estimator's: observations s_hat (N, 8), with sigma (N, 12), final_obs included.
 
-    s_hat is (q_hat, pusher, noisy force) without xi; sigma the four standard deviations sqrt(diag Sigma) in scaled units,
-    clipped to [0, 1] (appendix B.1). The estimator keeps a hidden state per world and forgets it at episode ends.
+    s_hat and sigma as `believe` returns them. The estimator keeps a hidden state per world and forgets it at episode ends.
     Infos: `belief` (N, 12), s_hat and sigma of this step in the frame of the env below; where an episode ended, of its end.
 
     Args:
@@ -23,7 +41,6 @@ class Believed(gym.vector.VectorWrapper):
     def __init__(self, env, estimator, passes, sigma):
         super().__init__(env)
         self.estimator, self.passes, self.size = estimator, passes, 12 if sigma else 8
-        self.device = next(estimator.parameters()).device
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (self.size,), np.float32)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, env.num_envs)
         self.hidden = None
@@ -48,10 +65,5 @@ class Believed(gym.vector.VectorWrapper):
             all_worlds[:, worlds] = new.to(all_worlds.dtype)
         return belief[:, :self.size], reward, terminated, truncated, infos
 
-    @torch.no_grad()
     def _believe(self, o, hidden):
-        x = torch.as_tensor(o, device=self.device)[None]
-        with autocast(self.device):
-            q, variance, hidden = self.estimator.predict(x, hidden, self.passes)
-        sigma = variance[0].sqrt().clamp(max=1.0)
-        return np.concatenate([q[0].cpu().numpy(), o[:, 4:8], sigma.cpu().numpy()], 1), hidden
+        return believe(self.estimator, o, hidden, self.passes)

@@ -182,13 +182,13 @@ class PushEnv(gym.Env):
 
 
 VIEW = 1.1 * task.WORKSPACE[0]  # m, the width of draw's picture
-_SQUARE = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+SQUARE = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
 
 
 def corners(pose):
     """Corners (4, 2) of the box at a pose (3,), m."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    return _SQUARE * task.BOX[:2] / 2 @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
+    return SQUARE * task.BOX[:2] / 2 @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
 
 
 def draw(state, width=800):
@@ -200,7 +200,7 @@ def draw(state, width=800):
         points = np.atleast_2d(points) * [1, -1] * width / VIEW + [width / 2, width / 4]
         return np.round(points * 16).astype(np.int32)
 
-    cv2.polylines(image, [pixels(_SQUARE * task.HALF)], True, (150, 150, 150), 2, cv2.LINE_AA, 4)
+    cv2.polylines(image, [pixels(SQUARE * task.HALF)], True, (150, 150, 150), 2, cv2.LINE_AA, 4)
     cv2.fillPoly(image, [pixels(corners(np.zeros(3)))], (170, 205, 240), cv2.LINE_AA, 4)
     cv2.fillPoly(image, [pixels(corners(state[:3]))], (30, 60, 130), cv2.LINE_AA, 4)
     front = state[:2] + np.array([np.cos(state[2]), np.sin(state[2])]) * task.BOX[0] / 2

@@ -84,19 +84,26 @@ def write(episode, mp4, gif):
     frames = [frame(*row, step) for step, row in enumerate(zip(*(episode[k] for k in ("state", "o", "belief"))))]
     frames += frames[-1:] * task.RATE  # the end stands for a second
 
-    def video(path):
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), task.RATE, (WIDTH, HEIGHT))
-        if not writer.isOpened():
-            raise UserError("this build of opencv has no mp4 encoder: install opencv-python-headless from requirements.txt")
-        for image in frames:
-            writer.write(image[..., ::-1])
-        writer.release()
-
     def animation(path):
         small = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in frames[::2]]
         palette = Image.fromarray(np.concatenate(small[::10])).quantize(128)
         first, *rest = (Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE) for image in small)
         first.save(path, save_all=True, append_images=rest, duration=2000 / task.RATE, loop=0)
 
-    write_atomic(mp4, video)
+    write_mp4(mp4, frames)
     write_atomic(gif, animation)
+
+
+def write_mp4(path, frames):
+    """Writes an iterable of images (height, width, 3) uint8 RGB as an mp4 at 15 frames a second."""
+    def video(temporary):
+        writer = None
+        for image in frames:
+            if writer is None:
+                writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"mp4v"), task.RATE, image.shape[1::-1])
+            if not writer.isOpened():
+                raise UserError("this build of opencv has no mp4 encoder: install opencv-python-headless from requirements.txt")
+            writer.write(image[..., ::-1])
+        writer.release()
+
+    write_atomic(path, video)

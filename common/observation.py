@@ -37,7 +37,7 @@ class ObservationModel:
         noisy = self._add(state, self.bias[worlds] + noise)
         self.held[worlds] = noisy[:, :3]
         self.left[worlds] = self._next_occlusion(start, seconds)
-        return _assemble(noisy, np.zeros(len(worlds), bool))
+        return assemble(noisy, np.zeros(len(worlds), bool))
 
     def step(self, state):
         """Observations (N, 9) of states (N, 7), float32: the scaled state (8) with the box held in an occlusion, and xi."""
@@ -46,7 +46,7 @@ class ObservationModel:
         noisy = self._add(state, self.bias + noise)
         self.held = noisy[:, :3] = np.where(occluded[:, None], self.held, noisy[:, :3])
         self.left = np.where(occluded, self.left - 1, self._next_occlusion(start, seconds))
-        return _assemble(noisy, occluded)
+        return assemble(noisy, occluded)
 
     def trajectory(self, states):
         """Observations (T, N, 9) of stored trajectories (T, N, 7), each from its episode's start."""
@@ -71,7 +71,8 @@ class ObservationModel:
         return noisy
 
 
-def _assemble(noisy, occluded):
+def assemble(noisy, occluded):
+    """Observations o (N, 9) of noisy states (N, 7) and occlusion flags (N,): scaled (8), and xi."""
     return np.concatenate([task.scale(noisy), occluded[:, None].astype(np.float32)], 1)
 
 

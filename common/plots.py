@@ -207,3 +207,20 @@ def sim(path):
     world = PushEnv("rgb_array")
     world.reset(seed=0)
     write_atomic(path, lambda temporary: cv2.imwrite(str(temporary), world.render()[..., ::-1]))
+
+
+def robot(columns, title, path):
+    """Fig. 1: scene, camera and top view in rows; columns (time in s, occluded, three images), occluded ones framed."""
+    figure, axes = new(2.6 * len(columns), 6.2, 3, len(columns), squeeze=False, height_ratios=(3, 3, 2.05))
+    for column, (seconds, occluded, images) in zip(axes.T, columns):
+        for ax, image in zip(column, images):
+            ax.imshow(image)
+            ax.set(xticks=[], yticks=[])
+            ax.grid(False)
+            for spine in ax.spines.values():
+                spine.set(visible=True, color="#D55E00" if occluded else "0.7", lw=3 if occluded else 0.8)
+        column[0].set_title(f"t = {seconds:.1f} s{', occluded' * bool(occluded)}")
+    for ax, label in zip(axes[:, 0], ("scene", "robot's camera", "from above")):
+        ax.set_ylabel(label)
+    figure.suptitle(title, fontsize=10)
+    save(figure, path)

@@ -33,6 +33,7 @@ class Worlds:
     Args:
         num: number of worlds.
         sub_steps: physics steps a control step.
+        rate: control steps a second.
 
     Attributes:
         box (N, 3) in m, m, rad; pusher (N, 2) in m; force (N, 2) in N: what the pusher feels, world frame, mean over the
@@ -40,11 +41,11 @@ class Worlds:
         space, bodies: pymunk's, and its N boxes.
     """
 
-    def __init__(self, num, sub_steps=SUB_STEPS):
-        self.num = num
+    def __init__(self, num, sub_steps=SUB_STEPS, rate=task.RATE):
+        self.num, self.rate = num, rate
         self.box, self.pusher, self.force = np.zeros((num, 3)), np.zeros((num, 2)), np.zeros((num, 2))
         self.dynamics = {name: np.zeros(num) for name in DYNAMICS}
-        self._sub_steps, self._dt = sub_steps, 1 / task.RATE / sub_steps
+        self._sub_steps, self._dt = sub_steps, 1 / rate / sub_steps
         self._static, self._dynamic = np.zeros(num), np.zeros(num)  # m/s, what friction can take of a speed in dt
         self._inertia = np.ones((num, 2))  # mass in kg, moment in kg m^2
         self._rest, self._touched, self._held = np.zeros((3, num), bool)  # at rest; pushed in the last sub-step, step
@@ -98,7 +99,7 @@ class Worlds:
         self.box = motion[:n, :3].copy()
         self.box[:, :2] -= self._origin
         self.pusher = motion[n:, :2] - self._origin
-        self.force = impulse * task.RATE
+        self.force = impulse * self.rate
 
     def _build(self):
         """One Space with all boxes, then all pushers, which is the order of pymunk.batch's arrays."""

@@ -20,6 +20,11 @@ def mirror(obs, sign):
     return out
 
 
+def mirror_action(action, sign):
+    """Actions (N, 2) reflected by signs (N, 2)."""
+    return np.where(sign < 0, BINS - 1 - action, action)
+
+
 class Mirrored(gym.vector.VectorWrapper):
     """What is seen, and the actions, in the frame of each episode's first observation (`signs`)."""
 
@@ -29,7 +34,7 @@ class Mirrored(gym.vector.VectorWrapper):
         return mirror(obs, self.sign), infos
 
     def step(self, action):
-        obs, *rest, infos = self.env.step(np.where(self.sign < 0, BINS - 1 - action, action))
+        obs, *rest, infos = self.env.step(mirror_action(action, self.sign))
         if "final_obs" in infos:
             infos["final_obs"] = mirror(infos["final_obs"], self.sign)
             self.sign = np.where(infos["_final_obs"][:, None], signs(obs), self.sign)

@@ -3,11 +3,14 @@ import math
 
 import numpy as np
 
+from common import task
+
 Z = 1.959964  # 95 % of a normal distribution
 ERRORS = ("trans_mean_l2_mm", "trans_rmse_mm", "rot_mean_abs_deg", "rot_rmse_deg")
 PAPER_ERRORS = {"vision": "49.83, 22.56", "mse": "7.62, 2.51", "likelihood": "6.83, 2.46", "ours": "4.42, 2.10"}
 PAPER_SUCCESS = {"est_uncertainty": "94%", "est": "92%", "est_mse": "64%", "priv_on_estimate": "83%", "end_to_end": "12%",
                  "behavior_cloning": "38%"}
+PAPER_ROBOT = {"natural": "19/20", "hand_5s": "10/10", "hand_full": "7/10"}
 PAPER_SWITCHES = {"priv_on_state": "2.68 +- 1.53", "est_uncertainty": "4.22 +- 2.67"}
 
 
@@ -115,3 +118,35 @@ def further(results):
     lines += [f"- {method}: {s['mean']:.2f} +- {s['std']:.2f} contact switches an episode, {s['episodes']:,} episodes "
               f"(paper: {PAPER_SWITCHES[method]})" for method, s in results["contact_switches"].items()]
     return "\n".join(lines)
+
+
+def robot_runs(logs):
+    """summary.json from {scenario: {run: log}}: successes with their interval, occlusion, times of the ticks, stops."""
+    summary = {}
+    for scenario, runs in logs.items():
+        if runs:
+            ended = [str(log["ended"]) for log in runs.values()]
+            ticks = {key: np.concatenate([log.get(key, []) for log in runs.values()]) for key in ("age", "busy")}
+            won = [end.startswith("success") for end in ended]
+            rate, some = wilson(won), len(ticks["busy"]) > 0
+            summary[scenario] = {
+                "successes": sum(won), "runs": len(won), "low": rate["low"], "high": rate["high"],
+                "by_estimate": any("estimate" in end for end in ended),
+                "occluded_share": float((ticks["age"] > 0).mean()) if some else None,
+                "tick_p50_ms": float(1e3 * np.percentile(ticks["busy"], 50)) if some else None,
+                "tick_p99_ms": float(1e3 * np.percentile(ticks["busy"], 99)) if some else None,
+                "missed": int((ticks["busy"] > 1 / task.RATE).sum()), "stops": ended.count("stopped")}
+    return summary
+
+
+def robot(summary):
+    """The hardware experiments (sec. 6) beside the paper's."""
+    rows = []
+    for scenario, r in summary.items():
+        some = r["tick_p50_ms"] is not None
+        rows.append([scenario, f"{r['successes']}/{r['runs']}{' by estimate' * r['by_estimate']}",
+                     f"[{100 * r['low']:.0f}, {100 * r['high']:.0f}] %", PAPER_ROBOT[scenario],
+                     f"{r['occluded_share']:.0%}" if some else "",
+                     f"{r['tick_p50_ms']:.1f} / {r['tick_p99_ms']:.1f}" if some else "", str(r["missed"]), str(r["stops"])])
+    header = ["scenario", "success", "95 %", "paper", "occluded frames", "tick p50 / p99 (ms)", "missed deadlines", "stops"]
+    return aligned(header, rows)

@@ -18,7 +18,7 @@ import torch
 from common import artifacts, networks, ppo, stacks, task, trajectories
 
 ROOT = Path(__file__).parent.parent
-SCRIPTS = ["01_train_privileged", "02_collect", "03_train_estimator", "04_train_policy", "05_evaluate"]
+SCRIPTS = ["01_train_privileged", "02_collect", "03_train_estimator", "04_train_policy", "05_evaluate", "06_robot"]
 SETS = {"train": 48, "validation": 12, "test": 12, "teacher_train": 48, "teacher_validation": 12}
 ESTIMATORS = {"ours", "likelihood", "mse"}
 POLICIES = {"est_uncertainty", "est", "est_mse", "end_to_end", "behavior_cloning"}
@@ -32,6 +32,7 @@ OUTPUTS = {
     "04_train_policy/behavior_cloning/seed0": ["policy.safetensors", "bc_loss.png"],
     "05_evaluate/seed0": ["results.json", "tables.md", "success_rate.png", "occlusion_duration.png", "sim.png",
                           "trajectory_with_uncertainty.png", "film.mp4", "film.gif"],
+    "06_robot/seed0": ["summary.json", "robot.png", "natural_000.npz", "hand_5s_000.npz", "hand_full_000.npz"],
 } | {f"04_train_policy/{m}/seed0": ["policy.safetensors", "success_rate.png"] for m in POLICIES - {"behavior_cloning"}}
 
 
@@ -105,7 +106,7 @@ def metrics(folder):
 def test_every_output_is_there(study, folder):
     folder, names = study / "smoke" / folder, OUTPUTS[folder]
     assert {path.name for path in folder.iterdir()} == {*names, "config.json", "metrics.csv"} - (
-        {"metrics.csv"} if folder.parent.name == "05_evaluate" else set())
+        {"metrics.csv"} if folder.parent.name in ("05_evaluate", "06_robot") else set())
     assert json.loads((folder / "config.json").read_text())["finished"]
     assert all(cv2.imread(str(path)).std() > 1 for path in folder.glob("*.png"))
 
@@ -256,7 +257,8 @@ def test_a_killed_run_ends_bit_for_bit_as_an_uninterrupted_one(study, tmp_path):
 
 
 @pytest.mark.parametrize("script, needed", [("02_collect", "01_train_privileged"), ("03_train_estimator", "02_collect"),
-                                            ("04_train_policy", "01_train_privileged"), ("05_evaluate", "01_train_privileged")])
+                                            ("04_train_policy", "01_train_privileged"), ("05_evaluate", "01_train_privileged"),
+                                            ("06_robot", "03_train_estimator")])
 def test_a_missing_stage_is_named(tmp_path, call, script, needed):
     assert is_mistake(*call(tmp_path / "runs", script), f"run python {needed}.py smoke", "first")
 

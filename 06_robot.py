@@ -1,0 +1,240 @@
+"""Stage 06: the policy on an arm with a camera, under natural and human-induced occlusions (sec. 6).
+
+    python 06_robot.py [smoke|quick|laptop|paper] [--scenario natural|hand_5s|hand_full] [--runs n] [--video] [--seed k]
+        [--realtime] [--arm module:Class] [--camera source] [--print-tags]
+
+Reads est_uncertainty (04) and the estimator ours (03). Writes runs/<preset>/06_robot/seed<k>/: summary.json, robot.png, a log
+<scenario>_<run>.npz a run and, with --video, two mp4 a run: the three views, and the camera alone. A rerun goes on with the next
+run. With --print-tags it only writes <out>/tags.pdf, the sheet for the box.
+"""
+import importlib
+import signal
+import time
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+
+from common import artifacts, belief, networks, observation, plots, symmetry, tables, task
+from common.env import PushVectorEnv
+from common.robot import hardware, iiwa, ik, runlog, safety, scene, tags, views
+
+SCENARIOS = ("natural", "hand_5s", "hand_full")
+STEPS = ik.QP_RATE // task.RATE  # QP steps a tick
+PATIENCE = 5 * task.RATE  # ticks to wait for the first sight
+CERTAIN = 5  # ticks that the estimate must stay in the tolerance, where nobody knows the truth
+
+
+@dataclass
+class Config(hardware.Gaps, artifacts.Stage):
+    scenario: Literal["natural", "hand_5s", "hand_full", "all"] = "all"
+    """occlusions: natural ones only; and a hand over the tags from a moment within 1 to 5 s, for 5 s or to the end (sec. 6)"""
+    runs: int = 20
+    """runs of each scenario (the paper: 20, 10, 10)"""
+    passes: int = 50
+    """M, stochastic passes of the estimator (sec. 4)"""
+    video: bool = False
+    """write the views and the camera's images of every run as mp4"""
+    realtime: bool = False
+    """let the simulated arm move as fast as a real one, not as fast as it can"""
+    arm: str = "simulated"
+    """module:Class of a real one, with the methods of hardware.Arm; it is given this config"""
+    camera: str = ""
+    """device number, file or address of a camera that OpenCV opens, instead of the arm's own"""
+    print_tags: bool = False
+    """write the sheet of tags for the box, and nothing else"""
+    free: ClassVar = ("scenario", "runs", "video", "realtime", "print_tags")
+
+
+PRESETS = {
+    "smoke": dict(runs=1, passes=2),
+    "quick": dict(runs=1, passes=20),
+    "laptop": dict(runs=100, passes=10),
+    "paper": {},
+}
+
+
+def connect(cfg):
+    """The arm behind its guard.
+
+    Raises:
+        artifacts.UserError: no such class or camera, or a gap below zero.
+    """
+    for name in vars(hardware.Gaps()):
+        if not getattr(cfg, name) >= 0:
+            raise artifacts.UserError(f"--{name.replace('_', '-')} {getattr(cfg, name)}: at least 0")
+    make = hardware.SimulatedArm
+    if cfg.arm != "simulated":
+        module, _, name = cfg.arm.partition(":")
+        try:
+            make = getattr(importlib.import_module(module), name)
+        except (ValueError, ImportError, AttributeError) as error:
+            raise artifacts.UserError(f"--arm {cfg.arm}: {error}; say simulated, or module:Class") from None
+    arm = make(cfg)
+    if not cfg.camera:
+        return safety.Guarded(arm)
+    clock = (lambda: arm.time) if isinstance(arm, hardware.SimulatedArm) else time.monotonic
+    return safety.Guarded(arm, hardware.VideoCamera(cfg.camera, clock, cfg.latency / task.RATE).grab)
+
+
+def prepare(arm, cfg, scenario, run):
+    """Box, look-pose and hand of a run. Returns from when to when the hand covers the tags, in s."""
+    rng = np.random.default_rng([cfg.seed, SCENARIOS.index(scenario), run, 4])
+    torch.manual_seed(int(rng.integers(2**62)))  # of the dropout masks
+    start = rng.uniform(1, 5)
+    hand = {"natural": (np.inf, np.inf), "hand_5s": (start, start + 5), "hand_full": (start, np.inf)}[scenario]
+    if not isinstance(arm, hardware.SimulatedArm):
+        try:
+            input(f"{scenario}, run {run + 1}: place the box, bring the pusher to where the camera sees it, and press Enter ")
+        except EOFError:
+            raise artifacts.UserError("a real arm needs someone at the terminal, to place the box") from None
+        return hand
+    world = PushVectorEnv(1)
+    while True:  # a start of the study from which the camera sees the box
+        world.reset(seed=int(rng.integers(2**31)))
+        arm.place(rng, world.box[0], world.pusher[0], world.dynamics, hand)
+        if tags.Tracker().update(arm.grab()[1], scene.wrist_camera(arm.points, arm.rotation)).seen is not None:
+            return hand
+
+
+def sense(arm, tracker):
+    """grab -> track. The first columns of a tick's row: see save_log."""
+    taken, image = arm.grab()
+    now, q = arm.read_joints()
+    sight = tracker.update(image, scene.wrist_camera(*iiwa.chain(arm.joints_then(taken))[1:]))
+    _, points, rotation = iiwa.chain(q)
+    return dict(time=now, joints=q, pusher=points[7, :2], force=(rotation @ arm.force)[:2], image=image, **vars(sight))
+
+
+def think(f, pi, passes, row, memory):
+    """believe -> act, in the mirrored frame in which the nets have learned; `memory` is None at a run's start.
+
+    Returns:
+        belief (12,) and action (2,) in the workspace's frame, and the next memory.
+    """
+    o = observation.assemble(np.concatenate([row["seen"], row["pusher"], row["force"]])[None], np.array([row["age"] > 0]))
+    sign, hidden, recall = memory or (symmetry.signs(o), None, None)
+    s_hat, hidden = belief.believe(f, symmetry.mirror(o, sign), hidden, passes)
+    with torch.no_grad(), networks.autocast("cpu"):
+        logits, recall = pi(torch.as_tensor(s_hat)[None], recall)
+    action = symmetry.mirror_action(networks.mode(logits[0]).numpy(), sign)
+    return symmetry.mirror(s_hat, sign)[0], action[0], (sign, hidden, recall)
+
+
+def drive(arm, velocity, wait):
+    """QP -> command: moves the pusher with (2,) m/s for one tick; returns how many of its programs were not solved."""
+    _, q = arm.read_joints()
+    unsolved = 0
+    for _ in range(STEPS):
+        speeds = ik.solve(q, velocity)
+        unsolved += speeds is None
+        arm.command(speeds)
+        wait()
+        _, q = arm.read_joints()
+        arm.read_wrench()
+    return unsolved
+
+
+def play(arm, f, pi, cfg, hand, rows):
+    """One run: grab -> track -> believe -> act -> QP -> command, 15 times a second. Returns how it ended.
+
+    Args:
+        arm: safety.Guarded; f, pi: estimator and policy; hand: (from, to) in s, to tell who covers the tags of a real arm.
+        rows: list that gets a dict a tick.
+    """
+    simulated = isinstance(arm.arm, hardware.SimulatedArm)
+    cues = {int(moment * task.RATE): f"now {word} the tags" for moment, word in zip(hand, ("cover", "uncover")) if moment < 60}
+    wait, tracker, memory, certain = hardware.pacer(cfg.realtime or not simulated), tags.Tracker(), None, 0
+    arm.read_joints(), arm.read_wrench()
+    for _ in range(PATIENCE):
+        drive(arm, np.zeros(2), wait)
+        if sense(arm, tracker)["seen"] is not None:
+            break
+    else:
+        return f"box not seen for {PATIENCE // task.RATE} s"
+
+    for tick in range(task.HORIZON):
+        began, slept = time.perf_counter(), wait.slept
+        row = sense(arm, tracker)
+        s_hat, action, memory = think(f, pi, cfg.passes, row, memory)
+        arm.require(np.isfinite(s_hat).all(), "the estimate is not finite")
+        row |= dict(estimated=task.unscale_pose(s_hat[:4]), sigma=s_hat[8:], action=action,
+                    true=arm.arm.box.copy() if simulated else np.full(3, np.nan), covered=simulated and arm.arm.covered)
+        if not simulated and tick in cues:
+            print(cues[tick])
+        row["unsolved"] = drive(arm, task.SPEEDS[action], wait)
+        row["busy"] = time.perf_counter() - began - (wait.slept - slept)
+        rows.append(row)
+
+        box, pusher = arm.arm.box if simulated else row["estimated"], iiwa.chain(arm.read_joints()[1])[1][7, :2]
+        certain = certain + 1 if task.reached(box) else 0
+        if certain >= (1 if simulated else CERTAIN):
+            return "success" if simulated else "success by estimate"
+        if task.outside(box, pusher):
+            return "out of the workspace"
+    return "out of time"
+
+
+def perform(arm, f, pi, cfg, run, logs, scenario, k):
+    """Run k of a scenario with all that is kept of it: film, figure, and last its log, by which a rerun knows it.
+
+    Raises:
+        safety.Stop: the arm has been stopped; the run is logged as "stopped".
+    """
+    rows, stop, name = [], None, f"{scenario}_{k:03d}"
+    hand = prepare(arm.arm, cfg, scenario, k)
+    try:
+        with arm:
+            ended = play(arm, f, pi, cfg, hand, rows)
+    except safety.Stop as reason:
+        ended, stop = "stopped", reason
+    log = runlog.log_of(rows, ended)
+    if rows and cfg.video:
+        views.write(rows, run.dir / f"{name}.mp4", run.dir / f"{name}_camera.mp4")
+    if rows and runlog.worth(log) > max((runlog.worth(other) for done in logs.values() for other in done.values() if "age" in other),
+                                 default=()):
+        plots.robot(views.columns(rows), f"{scenario}, run {k + 1}: {ended}", run.dir / "robot.png")
+    artifacts.write_atomic(run.dir / f"{name}.npz", lambda temporary: np.savez(temporary, **log))
+    logs[scenario][k] = log
+    artifacts.save_json(run.dir / "summary.json", tables.robot_runs(logs))
+    if stop:
+        raise stop
+    if not rows:
+        print(f"{name}: {ended}")
+    return f"{name} {ended} after {len(rows) / task.RATE:.1f} s"
+
+
+def main(cfg):
+    if cfg.print_tags:
+        tags.print_sheet(cfg.out / "tags.pdf")
+        return print(f"{cfg.out / 'tags.pdf'}: print it at 100 %, and measure the ruler")
+    torch.set_num_threads(1)  # the nets are small, and two threads wait for each other
+    paths = {"estimator": artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", "ours"),
+             "policy": artifacts.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty")}
+    f, pi = networks.load_estimator(paths["estimator"]), networks.load_recurrent(paths["policy"])
+    arm = connect(cfg)
+    run = artifacts.Run(cfg, "06_robot", paths)
+    logs = {scenario: runlog.read(run.dir, scenario) for scenario in SCENARIOS}
+    todo = [(scenario, k) for scenario in (SCENARIOS if cfg.scenario == "all" else [cfg.scenario]) for k in range(cfg.runs)
+            if k not in logs[scenario]]
+    if run.finished and not todo:
+        print(f"{tables.robot(tables.robot_runs(logs))}\n")
+        return run.skip()
+    bar = artifacts.bar(len(todo), "06_robot", unit="run")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # which stops the arm as Ctrl-C does
+    try:
+        for scenario, k in todo:
+            bar.set_postfix_str(perform(arm, f, pi, cfg, run, logs, scenario, k), refresh=False)
+            bar.update()
+            if run.out_of_time():
+                return run.stop()
+    finally:
+        arm.stop()
+    bar.close()
+    print(f"\n{tables.robot(tables.robot_runs(logs))}\n\nfigure, logs and summary.json: {run.dir}")
+    run.finish(["summary.json"])
+
+
+if __name__ == "__main__":
+    artifacts.main(Config, PRESETS, main, __doc__)

@@ -1,0 +1,169 @@
+"""What the robot script needs of an arm and a camera, a simulated arm behind it, and any OpenCV video source as the camera."""
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from common import task
+from common.artifacts import UserError
+from common.robot import iiwa, scene
+from common.robot.ik import QP_RATE
+from common.simulator import Worlds
+
+
+class Arm(Protocol):
+    """An arm with a force sensor and a camera, in SI units; times are those of time.monotonic() (the simulated arm has its own).
+
+    Whoever attaches a real one writes these five methods. The program calls `command` QP_RATE times a second, and reads joints and
+    wrench before each: both need new readings within 50 ms, and none may wait for one.
+    """
+
+    def read_joints(self) -> tuple[float, np.ndarray]:
+        """Time and joint angles (7,) in rad."""
+
+    def read_wrench(self) -> tuple[float, np.ndarray]:
+        """Time and the force (3,) in N that the pusher feels, tool frame, weight compensated."""
+
+    def grab(self) -> tuple[float, np.ndarray]:
+        """Time of exposure and the newest image (480, 640, 3) uint8 BGR, undistorted; None as an image where there is none."""
+
+    def command(self, velocity: np.ndarray) -> None:
+        """Joint velocities (7,) in rad/s, held until the next call; for safety zero where that does not come within 0.1 s."""
+
+    def stop(self) -> None:
+        """Zero velocity, and no other until the program has ended."""
+
+
+@dataclass
+class Gaps:
+    """What the simulated arm has and the training world has not."""
+
+    latency: float = 1.0
+    """camera latency in frames of 1/15 s"""
+    hand_eye_mm: float = 1.0
+    """standard deviation of the calibrated camera position in mm, drawn once a run"""
+    hand_eye_deg: float = 0.2
+    """standard deviation of the calibrated camera rotation in degrees, drawn once a run"""
+    servo_lag: float = 0.02
+    """time constant in s of the joints' first-order response"""
+    tool_mass: float = 0.3
+    """kg beyond the force sensor, whose inertia it feels (the paper's limitation)"""
+    force_bias: float = 0.7
+    """standard deviation of the force sensor's bias in N, drawn once a run (tab. occlusion_and_noise_params)"""
+    force_noise: float = 0.7
+    """standard deviation of each reading of the force sensor in N (tab. occlusion_and_noise_params)"""
+
+
+class SimulatedArm:
+    """An iiwa, its camera and its force sensor over a pymunk world; its clock runs on with each command, by 1/QP_RATE s.
+
+    Attributes: box (3,), the true pose in m, m, rad; covered, whether a hand is over the tags.
+    """
+
+    def __init__(self, gaps: Gaps):
+        self.gaps, self.stopped = gaps, False
+        self.worlds = Worlds(1, sub_steps=1, rate=QP_RATE)
+
+    def place(self, rng, box, pusher, dynamics, hand=(np.inf, np.inf)):
+        """Starts anew with a box (3,), a pusher (2,), dynamics as simulator.Worlds.place takes them, and a hand from, to (s)."""
+        g = self.gaps
+        self.rng, self.time, self.hand = rng, 0.0, hand
+        self.worlds.place(np.arange(1), box[None], pusher[None], dynamics)
+        self.joints, self.speeds = iiwa.joints_at(pusher), np.zeros(7)
+        self.points, self.rotation = iiwa.chain(self.joints)[1:]
+        self.velocity = self.acceleration = np.zeros(3)  # of the ball
+        self.error = rng.normal(0, [g.hand_eye_mm / 1e3] * 3 + [np.deg2rad(g.hand_eye_deg)] * 3)
+        self.bias = rng.normal(0, g.force_bias, 3)
+        self.past = deque(maxlen=1 + round(g.latency * QP_RATE / task.RATE))
+        self.remember()
+
+    @property
+    def box(self):
+        return self.worlds.box[0]
+
+    @property
+    def covered(self):
+        return self.hand[0] <= self.time < self.hand[1]
+
+    def remember(self):
+        self.past.append((self.time, self.box.copy(), self.points, self.rotation, self.covered))
+
+    def read_joints(self):
+        return self.time, self.joints.copy()
+
+    def read_wrench(self):
+        felt = np.append(self.worlds.force[0], 0.0) - self.gaps.tool_mass * self.acceleration
+        noise = self.rng.normal(0, self.gaps.force_noise, 3)
+        return self.time, self.rotation.T @ felt + self.bias + noise
+
+    def grab(self):
+        time, box, points, rotation, covered = self.past[0]
+        camera = scene.wrist_camera(points, rotation, self.error)
+        return time, scene.photograph(camera, box, points, covered, self.rng)
+
+    def command(self, velocity):
+        wanted = np.zeros(7) if self.stopped else velocity
+        lag = self.gaps.servo_lag
+        self.speeds = wanted + (self.speeds - wanted) * (np.exp(-1 / QP_RATE / lag) if lag else 0.0)
+        self.joints = self.joints + self.speeds / QP_RATE
+        before, self.time = self.points[7], self.time + 1 / QP_RATE
+        _, self.points, self.rotation = iiwa.chain(self.joints)
+        velocity = QP_RATE * (self.points[7] - before)
+        self.acceleration, self.velocity = QP_RATE * (velocity - self.velocity), velocity
+        self.worlds.step(QP_RATE * (self.points[7:, :2] - self.worlds.pusher))
+        self.remember()
+
+    def stop(self):
+        self.stopped, self.speeds = True, np.zeros(7)
+
+
+class VideoCamera:
+    """A camera that OpenCV opens: of a device number or an address always the newest image, of a file each image in turn.
+
+    Args:
+        source: device number, address or file.
+        clock: tells the arm's time in s.
+        latency: s from an exposure until the image is read.
+    Raises:
+        artifacts.UserError: OpenCV cannot open the source.
+    """
+
+    def __init__(self, source: str, clock: Callable[[], float], latency: float):
+        self.capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
+        if not self.capture.isOpened():
+            raise UserError(f"--camera {source}: OpenCV cannot open it; give a device number, a file or an address")
+        self.clock, self.latency, self.live = clock, latency, not Path(source).is_file()
+        if self.live:  # a thread, so that nobody waits for an image while the arm moves
+            self.newest = self.read()
+            threading.Thread(target=self.follow, daemon=True).start()
+
+    def read(self):
+        good, image = self.capture.read()
+        return self.clock() - self.latency, image if good else None
+
+    def follow(self):
+        while self.newest[1] is not None:
+            self.newest = self.read()
+
+    def grab(self):
+        """Time and image as Arm.grab has them."""
+        return self.newest if self.live else self.read()
+
+
+def pacer(on):
+    """wait(), which sleeps until the next QP step is due, and makes up for a late one; wait.slept counts the seconds slept."""
+    def wait():
+        now = time.perf_counter()
+        wait.due = max(wait.due + 1 / QP_RATE, now - 1 / task.RATE)
+        if on and wait.due > now:
+            time.sleep(wait.due - now)
+            wait.slept += wait.due - now
+
+    wait.due, wait.slept = time.perf_counter(), 0.0
+    return wait

@@ -1,0 +1,53 @@
+"""Joint velocities for a wanted velocity of the pusher: a quadratic program, built here and solved by Clarabel.
+
+    minimise    |W^1/2 (J_xy,yaw qd - v)|^2 + DAMPING |qd|^2 + POSTURE_WEIGHT |qd - POSTURE_GAIN (q_posture - q)|^2
+    subject to  height and tilt held:              J_z,tilt qd = -HOLD * their errors
+                joint speeds and positions:        lower(q) <= qd <= upper(q)
+                the workspace and MARGIN beyond:   J_xy qd <= HOLD (limit - xy), and likewise below
+"""
+import warnings
+
+import numpy as np
+import qpsolvers
+from scipy.sparse import csc_matrix
+
+from common import task
+from common.robot import iiwa
+
+warnings.filterwarnings("ignore", module="qpsolvers")  # what the solver says of a failure, solve returns
+
+QP_RATE = 150  # QP steps a second, ten a control step
+MARGIN = 0.010  # m, how far beyond the workspace the pusher may go
+WEIGHTS = np.array([1e4, 1e4, 1e2])  # of x, y (m/s) and yaw (rad/s): far above the posture's, which would leak into the path
+DAMPING, POSTURE_WEIGHT, POSTURE_GAIN = 1e-2, 1e-2, 0.2  # the gain in 1/s
+HOLD = 10.0  # 1/s, decay of the errors of height, tilt and yaw; a limit is approached no faster than HOLD times its distance
+LIMIT_GAP = np.deg2rad(2.0)  # rad, kept between a joint and its limit
+CLIMB, TURN = 0.02, 0.2  # m/s and rad/s, most that errors of height and of angles may ask for
+
+
+def build(q, velocity):
+    """The program at joint angles q (7,) rad for a wanted velocity (2,) m/s of the pusher, world frame."""
+    axes, points, rotation = iiwa.chain(q)
+    j, xy, turn = iiwa.jacobian(axes, points), points[7, :2], HOLD * iiwa.turned(rotation)
+    turn, rise = np.clip(turn, -TURN, TURN), np.clip(HOLD * (iiwa.HEIGHT - points[7, 2]), -CLIMB, CLIMB)
+
+    free, wanted = j[[0, 1, 5]], np.append(np.clip(velocity, -task.MAX_SPEED, task.MAX_SPEED), turn[2])
+    hessian = free.T @ (WEIGHTS[:, None] * free) + (DAMPING + POSTURE_WEIGHT) * np.eye(7)
+    gradient = -free.T @ (WEIGHTS * wanted) - POSTURE_WEIGHT * POSTURE_GAIN * (iiwa.POSTURE - q)
+
+    room = iiwa.LIMITS - LIMIT_GAP
+    upper = np.clip(HOLD * (room - q), -iiwa.SPEEDS, iiwa.SPEEDS)
+    lower = np.clip(HOLD * (-room - q), -iiwa.SPEEDS, iiwa.SPEEDS)
+    border = task.HALF + MARGIN
+    ahead, behind = (np.maximum(HOLD * (border - side * xy), -task.MAX_SPEED) for side in (1, -1))
+    bounds = np.concatenate([np.eye(7), -np.eye(7), j[:2], -j[:2]])
+    return qpsolvers.Problem(csc_matrix(hessian), gradient, csc_matrix(bounds), np.concatenate([upper, -lower, ahead, behind]),
+                             csc_matrix(j[2:5]), np.append(rise, turn[:2]))
+
+
+def solve(q, velocity):
+    """Joint velocities (7,) rad/s, or None: an input is not finite, the program is infeasible, or was not solved."""
+    if not (np.isfinite(q).all() and np.isfinite(velocity).all()):
+        return None
+    solution = qpsolvers.solve_problem(build(q, velocity), solver="clarabel")
+    return solution.x if solution.found and np.isfinite(solution.x).all() else None  # x is filled even in failure

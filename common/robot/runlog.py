@@ -1,0 +1,26 @@
+"""Logs of the robot's runs: what is kept of each, read back, and which is worth a figure."""
+import numpy as np
+
+
+def log_of(rows, ended):
+    """A run as arrays with a row a tick, in s, rad, m, N and the workspace's frame, and how it `ended`.
+
+    `seen` is the last fit of the tags, `age` how many frames ago that was, `residual` (m) of this frame's; sigma is of x, y, sin, cos
+    as the nets have them; `covered` is the hand; `unsolved` counts the programs without a solution; `busy` is the time computed.
+    """
+    kept = [key for key in (rows[0] if rows else ()) if key not in ("corners", "image")]
+    return {"ended": np.array(ended)} | {key: np.array([row[key] for row in rows]) for key in kept}
+
+
+def read(folder, scenario):
+    """Logs of a scenario: {number of the run: log}."""
+    logs = {}
+    for path in sorted(folder.glob(f"{scenario}_*.npz")):
+        with np.load(path) as file:
+            logs[int(path.stem.rpartition("_")[2])] = dict(file)
+    return logs
+
+
+def worth(log):
+    """Rank of a run as an example for the figure: a success, under a hand, with much occlusion."""
+    return str(log["ended"]).startswith("success"), bool(log["covered"].any()), (log["age"] > 0).mean()
