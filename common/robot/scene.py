@@ -53,9 +53,9 @@ def _looking(position, at, right):
     return np.stack([right, np.cross(forward, right), forward], 1)
 
 
-# The robot's camera: beside the flange, 0.28 m above the ball and looking at it; 60 degrees wide. World frame, tool pointing down
+# The robot's camera: beside the stem, 0.2 m above the ball and looking at it; 60 degrees wide. World frame, tool pointing down
 FOCAL, SIZE = 550.0, (640, 480)
-MOUNT = np.array([0.07, -0.07, 0.28])  # m, from the centre of the ball
+MOUNT = np.array([0.05, -0.05, 0.20])  # m, from the centre of the ball
 _LOOK = _looking(MOUNT, np.zeros(3), np.array([1.0, 0.0, 0.0]))
 _BESIDE = np.array([0.75, 0.95, 0.75])
 OVERVIEW = Camera(780.0, SIZE, _looking(_BESIDE, np.array([0.0, -0.1, 0.2]), np.array([-1.0, 0.75, 0.0])), _BESIDE)  # for figures
