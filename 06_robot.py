@@ -1,6 +1,6 @@
 """Stage 06: the policy on an arm with a camera, under natural and human-induced occlusions (sec. 6).
 
-    python 06_robot.py [smoke|quick|laptop|paper] [--scenario natural|hand_5s|hand_full] [--runs n] [--video] [--seed k]
+    python 06_robot.py [smoke|quick|laptop|paper] [--scenario natural|hand_5s|hand_full|all] [--runs n] [--video] [--seed k]
         [--realtime] [--arm module:Class] [--camera source] [--print-tags]
 
 Reads est_uncertainty (04) and the estimator ours (03). Writes runs/<preset>/06_robot/seed<k>/: summary.json, robot.png, a log
@@ -13,6 +13,7 @@ import time
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+import cv2
 import numpy as np
 import torch
 
@@ -209,7 +210,7 @@ def main(cfg):
     if cfg.print_tags:
         tags.print_sheet(cfg.out / "tags.pdf")
         return print(f"{cfg.out / 'tags.pdf'}: print it at 100 %, and measure the ruler")
-    torch.set_num_threads(1)  # the nets are small, and two threads wait for each other
+    torch.set_num_threads(1), cv2.setNumThreads(1)  # nets and images are small, and threads wait for each other
     paths = {"estimator": artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", "ours"),
              "policy": artifacts.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty")}
     f, pi = networks.load_estimator(paths["estimator"]), networks.load_recurrent(paths["policy"])

@@ -532,7 +532,7 @@ def test_mistakes_are_one_line(robot, args, words):
 
 def test_the_tags_can_be_printed_before_anything_is_trained(robot, nets):
     stdout, _, code, _ = robot("--print-tags")
-    assert code == 0 and (nets / "tags.pdf").stat().st_size > 10_000
+    assert code == 0 and (nets / "tags.pdf").stat().st_size > 2_000
 
 
 def test_the_same_seed_plays_the_same_run(robot):

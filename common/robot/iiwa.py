@@ -21,6 +21,7 @@ POSTURE = np.deg2rad([0.0, 84.0, 0.0, -84.0, 0.0, 12.0, 0.0])  # over the middle
 
 _SKEW = np.array([[[0, -z, y], [z, 0, -x], [-y, x, 0]] for x, y, z in AXES])  # cross products with the axes
 _SKEW2 = _SKEW @ _SKEW
+_CROSS = np.array([[[(i - j) * (j - k) * (k - i) / 2 for k in range(3)] for j in range(3)] for i in range(3)])
 
 
 def chain(q):
@@ -40,14 +41,19 @@ def chain(q):
     return axes, points, rotation
 
 
+def _cross(a, b):
+    """np.cross of (n, 3) and (n, 3), at a fifth of its time."""
+    return np.einsum("ijk,nj,nk->ni", _CROSS, a, b)
+
+
 def jacobian(axes, points):
     """(6, 7): velocity of the ball's centre and angular velocity of the tool, world frame, for each joint's rate."""
-    return np.concatenate([np.cross(axes, points[7] - points[:7]), axes], 1).T
+    return np.concatenate([_cross(axes, points[7] - points[:7]), axes], 1).T
 
 
 def turned(rotation):
     """Rotation vector (3,) in rad, world frame, to first order, that brings the tool's rotation (3, 3) to DOWN."""
-    return 0.5 * np.cross(rotation.T, DOWN.T).sum(0)
+    return 0.5 * _cross(rotation.T, DOWN.T).sum(0)
 
 
 def joints_at(xy):

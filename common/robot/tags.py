@@ -43,15 +43,15 @@ def print_sheet(path):
     image = sheet(scale)
     top, left = 300, (page.shape[1] - image.shape[1]) // 2
     page[top:top + image.shape[0], left:left + image.shape[1]] = image
-    cv2.rectangle(page, (left - 1, top - 1), (left + image.shape[1], top + image.shape[0]), 160, 1)
+    cv2.rectangle(page, (left - 2, top - 2), (left + image.shape[1] + 1, top + image.shape[0] + 1), 0, 3)
     below, first = top + image.shape[0] + 150, (page.shape[1] - scale // 10) // 2
     cv2.line(page, (first, below), (first + scale // 10, below), 0, 3)
     for x in range(first, first + scale // 10 + 1, scale // 100):
         cv2.line(page, (x, below - 20), (x, below + 20), 0, 3)
-    for i, words in enumerate(("Print at 100 %: this ruler is 100 mm long. Cut along the grey line.",
+    for i, words in enumerate(("Print at 100 %: this ruler is 100 mm long. Cut along the line.",
                                "+x of the box is to the right, +y up; glue it to the top of the box, 120 mm x 100 mm.")):
         cv2.putText(page, words, (first - 220, below + 90 + 50 * i), cv2.FONT_HERSHEY_SIMPLEX, 0.9, 0, 2, cv2.LINE_AA)
-    write_atomic(path, lambda temporary: Image.fromarray(page).save(temporary, resolution=scale * 0.0254))
+    write_atomic(path, lambda temporary: Image.fromarray(page > 127).save(temporary, resolution=scale * 0.0254))
 
 
 def detector():
