@@ -12,7 +12,8 @@ SIZE = 0.022  # m, side of a tag's black square; so small that the white between
 COLUMNS, ROWS = 4, 3
 PITCH = np.array([0.0284, 0.0305])  # m between centres: white margins of 6.4 and 8.5 mm
 LEAST = 2  # tags for a fit
-RESIDUAL = 0.0015  # m, rms of the corners; a worse fit is rejected
+DISTORTION = 0.03  # of a tag's side; a tag that is worse is rejected
+RESIDUAL = 0.001  # m, rms of the corners; a worse fit is rejected
 DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
 
 
@@ -73,18 +74,19 @@ def fit(corners, ids, camera):
         corners: (k, 4, 2) pixels; ids: (k,).
         camera: scene.Camera.
     Returns:
-        pose (3,) in m, m, rad and the residual, the rms distance in m of the corners that the fit is made from.
+        pose (3,) in m, m, rad and the residual, the rms distance in m of the corners.
     """
     seen, known = camera.on_plane(corners.reshape(-1, 2), task.BOX[2]), CORNERS[ids].reshape(-1, 2)
-    kept = np.ones(len(seen), bool)
-    for _ in range(3):  # again without the corners that something half hides
-        a, b = known - known[kept].mean(0), seen - seen[kept].mean(0)
-        angle = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])[kept].sum(), (a * b)[kept].sum())
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        miss = np.linalg.norm(b - a @ turn.T, axis=1)
-        centre, residual = seen[kept].mean(0) - turn @ known[kept].mean(0), np.sqrt(np.square(miss[kept]).mean())
-        kept = miss <= max(3 * np.median(miss), 1e-4)
-    return np.append(centre, angle), residual
+    a, b = known - known.mean(0), seen - seen.mean(0)
+    angle = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.append(seen.mean(0) - turn @ known.mean(0), angle), np.sqrt(np.square(b - a @ turn.T).sum(1).mean())
+
+
+def square(corners, camera):
+    """Which of the detected corners (k, 4, 2) are of a tag whose sides are as long as they should be: nothing half hides it."""
+    seen = camera.on_plane(corners.reshape(-1, 2), task.BOX[2]).reshape(-1, 4, 2)
+    return (np.abs(np.linalg.norm(seen - np.roll(seen, 1, 1), axis=2) / SIZE - 1) <= DISTORTION).all(1)
 
 
 @dataclass
@@ -113,6 +115,8 @@ class Tracker:
         ids = np.zeros(0, int) if ids is None else ids.ravel()
         ours = ids < len(CORNERS)
         corners, ids = np.array(corners, float).reshape(-1, 4, 2)[ours], ids[ours]
+        whole = square(corners, camera)
+        corners, ids = corners[whole], ids[whole]
         pose, residual = fit(corners, ids, camera) if len(ids) >= LEAST else (None, np.nan)
         if residual <= RESIDUAL:
             self.pose, self.age = pose, 0
