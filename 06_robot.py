@@ -63,16 +63,14 @@ def connect(cfg):
         artifacts.UserError: no such class or camera, or a gap below zero.
     """
     for name in vars(hardware.Gaps()):
-        if not getattr(cfg, name) >= 0:
-            raise artifacts.UserError(f"--{name.replace('_', '-')} {getattr(cfg, name)}: at least 0")
-    make = hardware.SimulatedArm
-    if cfg.arm != "simulated":
-        module, _, name = cfg.arm.partition(":")
-        try:
-            make = getattr(importlib.import_module(module), name)
-        except (ValueError, ImportError, AttributeError) as error:
-            raise artifacts.UserError(f"--arm {cfg.arm}: {error}; say simulated, or module:Class") from None
-    arm = make(cfg)
+        if not 0 <= getattr(cfg, name) < np.inf:
+            raise artifacts.UserError(f"--{name.replace('_', '-')} {getattr(cfg, name)}: at least 0, and finite")
+    module, _, name = cfg.arm.partition(":")
+    try:  # whatever goes wrong in somebody's class
+        arm = (hardware.SimulatedArm if cfg.arm == "simulated" else getattr(importlib.import_module(module), name))(cfg)
+    except Exception as error:
+        message = f"--arm {cfg.arm}: {type(error).__name__}: {error}; say simulated, or module:Class"
+        raise artifacts.UserError(message) from None
     if not cfg.camera:
         return safety.Guarded(arm)
     clock = (lambda: arm.time) if isinstance(arm, hardware.SimulatedArm) else time.monotonic

@@ -89,7 +89,7 @@ def main(config_class: type, presets: dict[str, dict], run: Callable, doc: str):
         sys.exit(141)
     except OSError as failure:
         # numpy gives no errno where the disk is full
-        if failure.errno not in (None, errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EEXIST, errno.ENOTDIR):
+        if failure.errno not in (None, errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR):
             raise
         message, code = f"cannot write ({failure}): make room, or choose another --out", 2
     print("error:", " ".join(message.split()), file=sys.stderr)

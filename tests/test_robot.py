@@ -523,7 +523,15 @@ def test_a_run_is_logged_and_filmed_and_its_film_can_be_the_camera(robot, nets):
     assert len(again["time"]) >= ticks - 3 and np.linalg.norm((again["true"] - log["true"][:len(again["true"])])[:20, :2]).max() < 2e-3
 
 
-@pytest.mark.parametrize("args, words", [(("--camera", "nothing.mp4"), "cannot open"), (("--arm", "nothing:Arm"), "module:Class"),
+def test_a_damaged_log_is_named(robot):
+    folder = robot("--scenario", "natural", seed=22)[3]
+    (folder / "natural_000.npz").write_bytes(b"")
+    _, stderr, code, _ = robot("--scenario", "natural", seed=22)
+    assert code == 2 and len(mistakes(stderr)) == 1 and "natural_000.npz is damaged: delete it" in stderr
+
+
+@pytest.mark.parametrize("args, words", [(("--latency", "inf"), "finite"), (("--arm", "json:loads"), "TypeError"),
+                                         (("--camera", "nothing.mp4"), "cannot open"), (("--arm", "nothing:Arm"), "module:Class"),
                                          (("--arm", "nothing"), "module:Class"), (("--runs", "0"), "at least 1")])
 def test_mistakes_are_one_line(robot, args, words):
     _, stderr, code, _ = robot(*args)

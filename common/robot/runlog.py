@@ -1,5 +1,9 @@
 """Logs of the robot's runs: what is kept of each, read back, and which is worth a figure."""
+import zipfile
+
 import numpy as np
+
+from common.artifacts import UserError
 
 
 def log_of(rows, ended):
@@ -13,11 +17,18 @@ def log_of(rows, ended):
 
 
 def read(folder, scenario):
-    """Logs of a scenario: {number of the run: log}."""
+    """Logs of a scenario: {number of the run: log}.
+
+    Raises:
+        artifacts.UserError: one is damaged.
+    """
     logs = {}
-    for path in sorted(folder.glob(f"{scenario}_*.npz")):
-        with np.load(path) as file:
-            logs[int(path.stem.rpartition("_")[2])] = dict(file)
+    for path in sorted(folder.glob(f"{scenario}_[0-9]*.npz")):
+        try:
+            with np.load(path) as file:
+                logs[int(path.stem.rpartition("_")[2])] = dict(file)
+        except (ValueError, OSError, EOFError, zipfile.BadZipFile):
+            raise UserError(f"{path} is damaged: delete it, and the same command plays that run again") from None
     return logs
 
 
