@@ -179,7 +179,7 @@ def perform(arm, f, pi, cfg, run, logs, scenario, k):
     """Run k of a scenario with all that is kept of it: film, figure, and last its log, by which a rerun knows it.
 
     Raises:
-        safety.Stop: the arm has been stopped; the run is logged as "stopped".
+        safety.Stop: the arm has been stopped; the run is logged as "stopped", if it was not Ctrl-C on a simulated arm.
     """
     rows, stop, name = [], None, f"{scenario}_{k:03d}"
     hand = prepare(arm.arm, cfg, scenario, k)
@@ -187,6 +187,8 @@ def perform(arm, f, pi, cfg, run, logs, scenario, k):
         with arm:
             ended = play(arm, f, pi, cfg, hand, rows)
     except safety.Stop as reason:
+        if isinstance(arm.arm, hardware.SimulatedArm) and str(reason).endswith("Ctrl-C"):
+            raise  # not the policy's failure: the same command plays the run again
         ended, stop = "stopped", reason
     log = runlog.log_of(rows, ended)
     if rows and cfg.video:
