@@ -98,7 +98,7 @@ def prepare(arm, cfg, scenario, run):
 
 
 def sense(arm, tracker):
-    """grab -> track. The first columns of a tick's row: see save_log."""
+    """grab -> track. The first columns of a tick's row: see runlog.log_of."""
     taken, image = arm.grab()
     now, q = arm.read_joints()
     sight = tracker.update(image, scene.wrist_camera(*iiwa.chain(arm.joints_then(taken))[1:]))
@@ -193,8 +193,8 @@ def perform(arm, f, pi, cfg, run, logs, scenario, k):
     log = runlog.log_of(rows, ended)
     if rows and cfg.video:
         views.write(rows, run.dir / f"{name}.mp4", run.dir / f"{name}_camera.mp4")
-    if rows and runlog.worth(log) > max((runlog.worth(other) for done in logs.values() for other in done.values() if "age" in other),
-                                 default=()):
+    others = [runlog.worth(other) for done in logs.values() for other in done.values() if "age" in other]
+    if rows and runlog.worth(log) > max(others, default=()):
         plots.robot(views.columns(rows), f"{scenario}, run {k + 1}: {ended}", run.dir / "robot.png")
     artifacts.write_atomic(run.dir / f"{name}.npz", lambda temporary: np.savez(temporary, **log))
     logs[scenario][k] = log

@@ -11,7 +11,6 @@ NEAR = 0.03  # m, nothing nearer is drawn
 STEM = 0.008  # m, radius of the pusher's stem
 HAND = 0.11  # m above the table, where a hand covers the tags
 BLUR, NOISE = 0.7, 3.0  # pixels, and grey levels: standard deviations in a camera image
-SCALE = 8000  # pixels a m of the box's texture
 WOOD, BOARD = (165, 195, 215), (120, 160, 200)  # colours are BGR
 STEEL, ORANGE, SKIN, RED = (175, 170, 165), (40, 110, 235), (150, 180, 225), (40, 40, 200)
 
@@ -84,8 +83,8 @@ def _table():
 
 _TABLE = _table()
 _TABLE_TO_M = np.array([[0.001, 0, -0.6995], [0, -0.001, 0.5995], [0, 0, 1]])
-_TOP = cv2.GaussianBlur(tags.sheet(SCALE), (0, 0), 1.5)
-_TOP_TO_M = np.array([[1 / SCALE, 0, 0.5 / SCALE - task.BOX[0] / 2], [0, -1 / SCALE, task.BOX[1] / 2 - 0.5 / SCALE], [0, 0, 1]])
+_TOP = cv2.GaussianBlur(tags.sheet(), (0, 0), 1.5)
+_TOP_TO_M = np.array([[1, 0, 0.5 - tags.SCALE * task.BOX[0] / 2], [0, -1, tags.SCALE * task.BOX[1] / 2 - 0.5], [0, 0, tags.SCALE]])
 _GRAIN = np.random.default_rng(1).normal(0, NOISE, (2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.int16)
 
 

@@ -9,6 +9,7 @@ from common import task
 from common.artifacts import write_atomic
 
 SIZE = 0.022  # m, side of a tag's black square; so small that the white between them keeps the outlines apart
+SCALE = 8000  # pixels a m of the sheet's image: a tag of 8 x 8 squares is 176 wide
 COLUMNS, ROWS = 4, 3
 PITCH = np.array([0.0284, 0.0305])  # m between centres: white margins of 6.4 and 8.5 mm
 LEAST = 2  # tags for a fit
@@ -26,33 +27,32 @@ def _corners():
 CORNERS = _corners()  # (12, 4, 2) in m, box frame, in the order in which OpenCV reports a tag's corners
 
 
-def sheet(scale=8000):
-    """The top of the box as an image (rows, columns) uint8 with `scale` pixels a m, +x to the right, +y up."""
-    width, height = np.round(task.BOX[:2] * scale).astype(int)
+def sheet():
+    """The top of the box as an image (rows, columns) uint8 with SCALE pixels a m, +x to the right, +y up."""
+    width, height = np.round(task.BOX[:2] * SCALE).astype(int)
     image = np.full((height, width), 255, np.uint8)
-    side = round(SIZE * scale)
+    side = round(SIZE * SCALE)
     for i, corners in enumerate(CORNERS):
-        left, top = np.round((corners[0] * [1, -1] + task.BOX[:2] / 2) * scale).astype(int)
+        left, top = np.round((corners[0] * [1, -1] + task.BOX[:2] / 2) * SCALE).astype(int)
         image[top:top + side, left:left + side] = cv2.aruco.generateImageMarker(DICTIONARY, i, side)
     return image
 
 
 def print_sheet(path):
     """Writes an A4 page (PDF) at true scale: the sheet, a line to cut along and a ruler of 100 mm."""
-    scale = 8000  # a tag of 8 x 8 squares is 176 pixels wide
-    page = np.full((round(0.297 * scale), round(0.210 * scale)), 255, np.uint8)
-    image = sheet(scale)
+    page = np.full((round(0.297 * SCALE), round(0.210 * SCALE)), 255, np.uint8)
+    image = sheet()
     top, left = 300, (page.shape[1] - image.shape[1]) // 2
     page[top:top + image.shape[0], left:left + image.shape[1]] = image
     cv2.rectangle(page, (left - 2, top - 2), (left + image.shape[1] + 1, top + image.shape[0] + 1), 0, 3)
-    below, first = top + image.shape[0] + 150, (page.shape[1] - scale // 10) // 2
-    cv2.line(page, (first, below), (first + scale // 10, below), 0, 3)
-    for x in range(first, first + scale // 10 + 1, scale // 100):
+    below, first = top + image.shape[0] + 150, (page.shape[1] - SCALE // 10) // 2
+    cv2.line(page, (first, below), (first + SCALE // 10, below), 0, 3)
+    for x in range(first, first + SCALE // 10 + 1, SCALE // 100):
         cv2.line(page, (x, below - 20), (x, below + 20), 0, 3)
     for i, words in enumerate(("Print at 100 %: this ruler is 100 mm long. Cut along the line.",
                                "+x of the box is to the right, +y up; glue it to the top of the box, 120 mm x 100 mm.")):
         cv2.putText(page, words, (first - 220, below + 90 + 50 * i), cv2.FONT_HERSHEY_SIMPLEX, 0.9, 0, 2, cv2.LINE_AA)
-    write_atomic(path, lambda temporary: Image.fromarray(page > 127).save(temporary, resolution=scale * 0.0254))
+    write_atomic(path, lambda temporary: Image.fromarray(page > 127).save(temporary, resolution=SCALE * 0.0254))
 
 
 def detector():
