@@ -26,7 +26,7 @@ PRESETS = {
                   eval_every=3, eval_episodes=16, resume_every=2, tolerance=4.0, near_share=0.5),
     "quick": dict(num_envs=1024, rollout_steps=32, updates=500, minibatch=4096, epochs=3, sizes=(64, 128, 64),
                   checkpoints=26, entropy=0.002, kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.8),
-    "laptop": dict(num_envs=1024, rollout_steps=32, updates=4000, minibatch=4096, epochs=3, checkpoints=100, entropy=0.002,
+    "laptop": dict(num_envs=1024, rollout_steps=32, updates=1500, minibatch=4096, epochs=3, checkpoints=100, entropy=0.002,
                    kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.8),
     "paper": {},
 }
@@ -55,8 +55,9 @@ def main(cfg):
     networks.save_recurrent(run.dir / "policy.safetensors", pi_priv)
     networks.save_recurrent(run.dir / "value.safetensors", critic)
     plots.success_rate_priv(run.dir.parent, run.dir / "success_rate_priv.png")
-    run.finish(["policy.safetensors", "value.safetensors", *names], success=run.rows()[-1]["success"])
-    print(f"{run.dir}: pi_priv succeeds in {run.rows()[-1]['success']:.1%} of held-out episodes")
+    last = run.rows()[-1]
+    run.finish(["policy.safetensors", "value.safetensors", *names], steps=int(last["steps"]), success=last["success"])
+    print(f"{run.dir}: pi_priv succeeds in {last['success']:.1%} of held-out episodes")
 
 
 if __name__ == "__main__":

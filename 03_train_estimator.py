@@ -41,8 +41,8 @@ class Config(artifacts.Stage):
 
 PRESETS = {
     "smoke": dict(sizes=(16, 16, 16), sequences=16, epochs=2, validation=12),
-    "quick": dict(sizes=(256, 256, 256), sequences=25, epochs=5, lr=2e-3, lr_end=5e-5, validation=500),
-    "laptop": dict(sizes=(512, 512, 256), sequences=32, epochs=20, lr=2e-3, lr_end=5e-5, validation=1000),
+    "quick": dict(sizes=(256, 256, 256), sequences=32, epochs=8, lr=4e-3, lr_end=5e-5, validation=500),
+    "laptop": dict(sizes=(256, 256, 256), sequences=32, epochs=12, lr=4e-3, lr_end=5e-5, validation=1000),
     "paper": {},
 }
 
@@ -98,8 +98,9 @@ def main(cfg):
             outputs.append("passes.json")
         name = "mse_loss" if method == "mse" else "likelihood_loss"
         plots.validation_loss(run.dir.parent.parent, name, run.dir / f"{name}.png")
-        run.finish(outputs)
-        print(f"{run.dir}: validation loss {min(row['validation_loss'] for row in run.rows()):.4f}")
+        lowest = min(row["validation_loss"] for row in run.rows())
+        run.finish(outputs, epochs=len(run.rows()), validation_loss=lowest)
+        print(f"{run.dir}: validation loss {lowest:.4f}")
 
 
 if __name__ == "__main__":

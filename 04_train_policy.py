@@ -132,12 +132,12 @@ def main(cfg):
         networks.save_recurrent(run.dir / "policy.safetensors", pi)
         if method == "behavior_cloning":
             plots.validation_loss(run.dir.parent.parent, "bc_loss", run.dir / "bc_loss.png")
-            told = f"validation loss {min(row['validation_loss'] for row in run.rows()):.4f}"
+            card = dict(epochs=len(run.rows()), validation_loss=min(row["validation_loss"] for row in run.rows()))
         else:
             plots.success_rate(run.dir.parent.parent, run.dir / "success_rate.png")
-            told = f"succeeds in {run.rows()[-1]['success']:.1%} of held-out episodes"
-        run.finish(["policy.safetensors"])
-        print(f"{run.dir}: {told}")
+            card = dict(steps=int(run.rows()[-1]["steps"]), success=run.rows()[-1]["success"])
+        run.finish(["policy.safetensors"], **card)
+        print(f"{run.dir}: " + ", ".join(f"{name.replace('_', ' ')} {value:,}" for name, value in card.items()))
 
 
 if __name__ == "__main__":

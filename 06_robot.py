@@ -1,16 +1,18 @@
 """Stage 06: the policy on an arm with a camera, under natural and human-induced occlusions (sec. 6).
 
-    python 06_robot.py [smoke|quick|laptop|paper] [--scenario natural|hand_5s|hand_full|all] [--runs n] [--video] [--seed k]
-        [--realtime] [--arm module:Class] [--camera source] [--print-tags]
+    python 06_robot.py [pretrained|smoke|quick|laptop|paper] [--weights DIR] [--scenario natural|hand_5s|hand_full|all]
+        [--runs n] [--video] [--seed k] [--realtime] [--arm module:Class] [--camera source] [--print-tags]
 
-Reads est_uncertainty (04) and the estimator ours (03). Writes runs/<preset>/06_robot/seed<k>/: summary.json, robot.png, a log
-<scenario>_<run>.npz a run and, with --video, two mp4 a run: the three views, and the camera alone. A rerun goes on with the next
-run. With --print-tags it only writes <out>/tags.pdf, the sheet for the box.
+Reads est_uncertainty (04) and the estimator ours (03): of the same preset, or in the folder --weights, which is pretrained/
+with the preset pretrained. Writes runs/<preset>/06_robot/seed<k>/: summary.json, robot.png, a log <scenario>_<run>.npz a run
+and, with --video, two mp4 a run: the three views, and the camera alone. A rerun goes on with the next run. With --print-tags
+it only writes <out>/tags.pdf, the sheet for the box.
 """
 import importlib
 import signal
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import cv2
@@ -28,7 +30,7 @@ CERTAIN = 5  # ticks that the estimate must stay in the tolerance, where nobody 
 
 
 @dataclass
-class Config(hardware.Gaps, artifacts.Stage):
+class Config(hardware.Gaps, artifacts.Reader):
     scenario: Literal["natural", "hand_5s", "hand_full", "all"] = "all"
     """occlusions: natural ones only; and a hand over the tags from a moment within 1 to 5 s, for 5 s or to the end (sec. 6)"""
     runs: int = 20
@@ -45,10 +47,11 @@ class Config(hardware.Gaps, artifacts.Stage):
     """device number, file or address of a camera that OpenCV opens, instead of the arm's own"""
     print_tags: bool = False
     """write the sheet of tags for the box, and nothing else"""
-    free: ClassVar = ("scenario", "runs", "video", "realtime", "print_tags")
+    free: ClassVar = ("weights", "scenario", "runs", "video", "realtime", "print_tags")
 
 
 PRESETS = {
+    "pretrained": dict(weights=Path("pretrained"), runs=10, passes=10),
     "smoke": dict(runs=1, passes=2),
     "quick": dict(runs=1, passes=20),
     "laptop": dict(runs=100, passes=10),

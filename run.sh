@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
+# ./run.sh pretrained                   the published nets: environment, then evaluation and robot
 # ./run.sh [smoke|quick|laptop|paper]   the whole study: environment, then the numbered scripts in order (default: quick)
 # ./run.sh test                         the tests
 set -euo pipefail
 cd "$(dirname "$0")"
 what=${1:-quick}
-case $what in smoke|quick|laptop|paper|test) ;; *) echo "error: $what: say smoke, quick, laptop, paper or test" >&2; exit 2 ;; esac
+case $what in pretrained|smoke|quick|laptop|paper|test) ;; *) echo "error: $what: say pretrained, smoke, quick, laptop, paper or test" >&2; exit 2 ;; esac
 [ $# -le 1 ] || { echo "error: one word only; for settings run the scripts by hand (see README.md)" >&2; exit 2; }
 
 if ! cmp -s requirements.txt .venv/installed.txt; then
@@ -19,6 +20,8 @@ fi
 if [ "$what" = test ]; then
     exec .venv/bin/python -m pytest -q
 fi
-for script in 0*.py; do
+scripts=(0*.py)
+[ "$what" != pretrained ] || scripts=(05*.py 06*.py)
+for script in "${scripts[@]}"; do
     .venv/bin/python "$script" "$what"
 done

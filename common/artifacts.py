@@ -49,8 +49,33 @@ class Stage:
     max_minutes: float = float("inf")
     """stop at the next resume point after so many minutes"""
 
-    def folder(self, stage: str, method: str | None, seed: int) -> Path:
-        return self.out / self.preset / stage / (method or "") / f"seed{seed}"
+    @property
+    def own(self) -> Path:
+        """Folder that the run folders of this preset lie in."""
+        return self.out / self.preset
+
+    @property
+    def root(self) -> Path:
+        """Folder that the run folders of earlier stages lie in."""
+        return self.own
+
+
+@dataclass
+class Reader(Stage):
+    """A stage that trains nothing: it can be shown trained nets from elsewhere."""
+
+    free: ClassVar = ("weights",)
+    weights: Path | None = None
+    """folder to read instead of <out>/<preset>, of a finished study or of what it published: pretrained"""
+
+    @property
+    def root(self) -> Path:
+        return self.weights or self.own
+
+
+def run_folder(root: Path, stage: str, method: str | None, seed: int) -> Path:
+    """A run folder."""
+    return root / stage / (method or "") / f"seed{seed}"
 
 
 def parse(config_class: type, presets: dict[str, dict], doc: str, args: list[str]):
@@ -144,12 +169,14 @@ def digest(path: Path) -> dict:
         return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), "bytes": path.stat().st_size}
 
 
-def command_for(cfg: Stage, folder: Path) -> str:
-    """What to type for a run folder: python 0N_name.py preset [--method m] [--seed k] [--out root]."""
-    stage, *method, seed = folder.relative_to(cfg.out / cfg.preset).parts
+def remedy(cfg: Stage, folder: Path, more: str = "") -> str:
+    """What to do about a run folder: run python 0N_name.py preset [--method m] [--seed k] [--out root]."""
+    if not folder.is_relative_to(cfg.own):
+        return f"--weights {cfg.root} is not, or no longer, the folder of a finished study"
+    stage, *method, seed = folder.relative_to(cfg.own).parts
     method = f" --method {method[0]}" if method else ""
     seed = f" --seed {seed[4:]}" if seed != "seed0" else ""
-    return f"python {stage}.py {cfg.preset}{method}{seed}" + (f" --out {cfg.out}" if cfg.out != Stage.out else "")
+    return f"run python {stage}.py {cfg.preset}{method}{seed}" + (f" --out {cfg.out}" if cfg.out != Stage.out else "") + more
 
 
 def record_of(cfg: Stage, folder: Path) -> dict | None:
@@ -158,28 +185,28 @@ def record_of(cfg: Stage, folder: Path) -> dict | None:
     try:
         return json.loads(path.read_text()) if path.exists() else None
     except ValueError:
-        raise UserError(f"{path} is damaged: run {command_for(cfg, folder)} --force") from None
+        raise UserError(f"{path} is damaged: {remedy(cfg, folder, ' --force')}") from None
 
 
 def find(cfg: Stage, stage: str, name: str, method: str | None = None, seed: int = 0) -> Path:
     """Path of an earlier stage's artifact: finished, whole (above 64 MiB: of the right size), and not stale."""
-    folder = cfg.folder(stage, method, seed)
-    path, command, record = folder / name, command_for(cfg, folder), record_of(cfg, folder)
+    folder = run_folder(cfg.root, stage, method, seed)
+    path, record = folder / name, record_of(cfg, folder)
     if not record or not record["finished"]:
-        raise UserError(f"{path} is {'unfinished' if record else 'missing'}: run {command} first")
+        raise UserError(f"{path} is {'unfinished' if record else 'missing'}: {remedy(cfg, folder, ' first')}")
     check_fresh(cfg, folder, record)
     made = record["outputs"].get(name)
     whole = made and path.exists() and path.stat().st_size == made["bytes"]
     if not whole or (made["bytes"] <= 64 * 2**20 and digest(path) != made):
-        raise UserError(f"{path} is missing or damaged: run {command} --force")
+        raise UserError(f"{path} is missing or damaged: {remedy(cfg, folder, ' --force')}")
     return path
 
 
 def recorded(cfg: Stage, key: str) -> tuple[Path, dict | None, str | None]:
-    """Run folder, record and sha256 of an artifact given by its path relative to <out>/<preset>."""
-    folder, name = re.fullmatch(r"(.+?/seed\d+)/(.+)", key).groups()
-    record = record_of(cfg, cfg.out / cfg.preset / folder)
-    return cfg.out / cfg.preset / folder, record, record and record["outputs"].get(name, {}).get("sha256")
+    """Run folder, record and sha256 of an artifact given by its path relative to the root."""
+    place, name = re.fullmatch(r"(.+?/seed\d+)/(.+)", key).groups()
+    record = record_of(cfg, cfg.root / place)
+    return cfg.root / place, record, record and record["outputs"].get(name, {}).get("sha256")
 
 
 def check_fresh(cfg: Stage, folder: Path, record: dict):
@@ -189,18 +216,18 @@ def check_fresh(cfg: Stage, folder: Path, record: dict):
         if before:
             check_fresh(cfg, earlier, before)
             if now != sha:
-                raise UserError(f"{folder} is stale, its input {key} changed: run {command_for(cfg, folder)} --force")
+                raise UserError(f"{folder} is stale, its input {key} changed: {remedy(cfg, folder, ' --force')}")
 
 
 class Run:
     """One run folder: begun, gone on with, or found finished. Other settings or inputs than its own are an error."""
 
     def __init__(self, cfg: Stage, stage: str, inputs: dict[str, Path] = {}, method: str | None = None):
-        self.cfg, self.dir = cfg, cfg.folder(stage, method, cfg.seed)
+        self.cfg, self.dir = cfg, run_folder(cfg.own, stage, method, cfg.seed)
         self.began, self.minutes_before, self.logged, self.columns = time.monotonic(), 0.0, 0, []
         words = [re.sub(r"(^|=)[/~].*/(?=.)", r"\1", word) for word in sys.argv]  # absolute paths lose their folder
         settings = {name: value for name, value in asdict(cfg).items() if name == "seed" or not hasattr(Stage, name) and name not in cfg.free}
-        keys = (path.relative_to(cfg.out / cfg.preset).as_posix() for path in inputs.values())
+        keys = (path.relative_to(cfg.root).as_posix() for path in inputs.values())
         self.record = {
             "command": " ".join(["python", Path(words[0]).name, *words[1:]]),
             "versions": {"python": sys.version.split()[0]}

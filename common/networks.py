@@ -94,7 +94,17 @@ def dropout(x, p):
         return x
     bits = torch.empty((x.numel() + 3) // 4, dtype=torch.int64, device=x.device).random_(-2**63, None)
     keep = bits.view(torch.int16)[:x.numel()].view(x.shape) >= round(p * 2**16) - 2**15
-    return x * (keep / (1 - p)).to(x.dtype)
+    return x * keep.view(torch.uint8).to(x.dtype).mul_(1 / (1 - p))
+
+
+class EvenLSTM(nn.LSTM):
+    """An LSTM that gives odd inputs one more, always zero: oneDNN's matrix units take even widths only, three times as fast."""
+
+    def __init__(self, inputs, size):
+        super().__init__(inputs + inputs % 2, size)
+
+    def forward(self, x, hidden=None):
+        return super().forward(F.pad(x, (0, self.input_size - x.shape[-1])), hidden)
 
 
 class Estimator(nn.Module):
@@ -109,7 +119,8 @@ class Estimator(nn.Module):
     def __init__(self, sizes=(1024, 512, 256), dropout=0.2, likelihood=True):
         super().__init__()
         self.sizes, self.dropout, self.likelihood = tuple(sizes), dropout, likelihood
-        self.lstm = nn.LSTM(9, sizes[0])
+        self.lstm = EvenLSTM(9, sizes[0])
+        nn.init.ones_(self.lstm.bias_ih_l0[sizes[0]:2 * sizes[0]])  # the forget gates begin open
         self.layers = nn.ModuleList([nn.Linear(sizes[0], sizes[1]), nn.Linear(sizes[1], sizes[2]),
                                      nn.Linear(sizes[2], 8 if likelihood else 4)])
 
@@ -155,9 +166,13 @@ def mse(q, target, mask):
     return ((target - q).square().mean(-1) * mask).sum() / mask.sum()
 
 
+def _halves(net):
+    return {name: x.half() for name, x in net.state_dict().items()}
+
+
 def save_recurrent(path, net):
-    """Writes a policy or value net as safetensors, with its sizes."""
-    artifacts.save_tensors(path, net, inputs=net.inputs, outputs=net.head[-1].out_features, sizes=net.sizes)
+    """Writes a policy or value net as float16 safetensors, with its sizes."""
+    artifacts.save_tensors(path, _halves(net), inputs=net.inputs, outputs=net.head[-1].out_features, sizes=net.sizes)
 
 
 def load_recurrent(path, device="cpu"):
@@ -166,8 +181,8 @@ def load_recurrent(path, device="cpu"):
 
 
 def save_estimator(path, net):
-    """Writes an estimator as safetensors, with its sizes and kind."""
-    artifacts.save_tensors(path, net, sizes=net.sizes, dropout=net.dropout, likelihood=net.likelihood)
+    """Writes an estimator as float16 safetensors, with its sizes and kind."""
+    artifacts.save_tensors(path, _halves(net), sizes=net.sizes, dropout=net.dropout, likelihood=net.likelihood)
 
 
 def load_estimator(path, device="cpu"):

@@ -26,21 +26,21 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
     if state := run.load_resume():
         net.load_state_dict(state["net"]), optimizer.load_state_dict(state["optimizer"])
         first, best = state["epoch"], state["best"]
-    updates = math.ceil(count / sequences)
+    updates, usual = math.ceil(count / sequences), data[1][-1] / count * sequences  # steps of a mini-batch
     bar = artifacts.bar(epochs * updates, run.dir.parent.name, initial=first * updates, unit="update")
     for epoch in range(first, epochs):
         rng = np.random.default_rng([seed, epoch])
         torch.manual_seed(int(rng.integers(2**62)))
-        losses = []
-        for k, index in enumerate(trajectories.batches(rng.permutation(count), sequences)):
+        losses, weights = [], []
+        for k, index in enumerate(trajectories.shuffled(data, sequences, rng)):
             progress = (epoch + k / updates) / epochs
             optimizer.param_groups[0]["lr"] = lr_end + (lr - lr_end) * (1 + math.cos(math.pi * progress)) / 2
-            value, _ = loss(data, index, (seed, epoch, k, 1))  # the last number keeps apart what the seeds are for
+            value, steps = loss(data, index, (seed, epoch, k, 1))  # the last number keeps apart what the seeds are for
             optimizer.zero_grad(set_to_none=True)
-            value.backward()
+            (value * (steps / usual)).backward()  # a step counts the same in every mini-batch
             torch.nn.utils.clip_grad_norm_(net.parameters(), grad_norm)
             optimizer.step()
-            losses.append(value.item())
+            losses.append(value.item()), weights.append(steps)
             bar.update()
             bar.set_postfix_str(f"loss {losses[-1]:.3f}", refresh=False)
         with torch.no_grad():  # the same noise and occlusions every epoch
@@ -49,7 +49,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
         validation_loss = float(np.average([v.item() for v in values], weights=steps))
         if not math.isfinite(validation_loss):
             raise artifacts.UserError(f"{run.dir}: training diverged in epoch {epoch + 1}: use a lower rate, and --force")
-        run.log(epoch=epoch + 1, train_loss=float(np.mean(losses)), validation_loss=validation_loss)
+        run.log(epoch=epoch + 1, train_loss=float(np.average(losses, weights=weights)), validation_loss=validation_loss)
         if validation_loss < best:
             best = validation_loss
             save()

@@ -5,6 +5,8 @@ import torch
 from common import artifacts, symmetry, task
 from common.observation import ObservationModel
 
+POOL = 16  # mini-batches that are sorted by length together: random ones are a quarter padding
+
 
 def load(states_path, offsets_path):
     """Trajectories as states (steps, 7) float32, memory-mapped, and offsets (n + 1,).
@@ -46,6 +48,14 @@ def padded(data, index):
 def batches(indices, size):
     """Indices of trajectories in batches of `size`, the last one what is left."""
     return [indices[i:i + size] for i in range(0, len(indices), size)]
+
+
+def shuffled(data, size, rng):
+    """Indices of all trajectories in batches of `size` in random order; those of a batch are of similar length."""
+    lengths = np.diff(data[1])
+    pools = [pool[lengths[pool].argsort()] for pool in batches(rng.permutation(len(lengths)), POOL * size)]
+    parts = [part for pool in pools for part in batches(pool, size)]
+    return [parts[i] for i in rng.permutation(len(parts))]
 
 
 def subset(data, count):

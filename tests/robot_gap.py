@@ -24,7 +24,7 @@ robot = importlib.import_module("06_robot")
 
 def main(cfg):
     torch.set_num_threads(1)
-    folder = cfg.folder("06_robot", None, cfg.seed)
+    folder = artifacts.run_folder(cfg.own, "06_robot", None, cfg.seed)
     logs = runlog.read(folder, "natural")
     if not logs:
         raise artifacts.UserError(f"{folder}: no natural runs; run python 06_robot.py {cfg.preset} --scenario natural first")

@@ -24,7 +24,7 @@ def small(**kw):
 def test_the_papers_sizes_are_the_defaults():
     assert shapes(networks.policy(12)) == [(12, 128), (128, 256), (256, 128), (128, 22)]
     assert shapes(networks.value(8)) == [(8, 128), (128, 256), (256, 128), (128, 1)]
-    assert shapes(networks.Estimator()) == [(9, 1024), (1024, 512), (512, 256), (256, 8)]
+    assert shapes(networks.Estimator()) == [(9 + 1, 1024), (1024, 512), (512, 256), (256, 8)]
     assert shapes(networks.Estimator(likelihood=False))[-1] == (256, 4)
     assert networks.Estimator().dropout == 0.2
 
@@ -126,6 +126,12 @@ def test_without_dropout_the_head_is_tanh_layers():
     torch.testing.assert_close(torch.cat(f.head(z), -1), c(torch.tanh(b(torch.tanh(a(z))))))
 
 
+def test_a_tenth_input_is_zero_and_changes_nothing():
+    f, plain = small(dropout=0.0), nn.LSTM(9, 16)
+    plain.load_state_dict({name: x[:, :9] if name == "weight_ih_l0" else x for name, x in f.lstm.state_dict().items()})
+    torch.testing.assert_close(f.lstm(INPUTS)[0], plain(INPUTS)[0])
+
+
 def test_log_variances_are_clamped():
     f = small()
     with torch.no_grad():
@@ -187,6 +193,8 @@ def test_mse_is_over_valid_steps():
 
 def test_nets_come_back_from_files(tmp_path):
     net, f = networks.policy(12, (8, 6, 4)), small(dropout=0.0, likelihood=False)
+    for weights in (*net.parameters(), *f.parameters()):
+        weights.data = weights.half().float()  # as the files hold them
     networks.save_recurrent(policy := tmp_path / "policy.safetensors", net)
     networks.save_estimator(estimator := tmp_path / "estimator.safetensors", f)
     again, f_again = networks.load_recurrent(policy), networks.load_estimator(estimator)

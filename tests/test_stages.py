@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from common import artifacts, networks, ppo, stacks, task, trajectories
+from common.env import PushVectorEnv
 
 ROOT = Path(__file__).parent.parent
 SCRIPTS = ["01_train_privileged", "02_collect", "03_train_estimator", "04_train_policy", "05_evaluate", "06_robot"]
@@ -119,7 +120,7 @@ def test_nothing_else_was_written(study):
 def test_checkpoints_go_from_the_untrained_to_the_last_policy(study):
     folder = study / "smoke" / "01_train_privileged" / "seed0"
     torch.manual_seed(0)
-    untrained = networks.policy(8, (16, 16, 16)).state_dict()
+    untrained = {name: x.half() for name, x in networks.policy(8, (16, 16, 16)).state_dict().items()}
     first, middle, last = (artifacts.load_tensors(path)[0] for path in sorted(folder.glob("checkpoint_*")))
     policy = artifacts.load_tensors(folder / "policy.safetensors")[0]
     assert all(first[name].equal(untrained[name]) and last[name].equal(policy[name]) for name in policy)
@@ -151,7 +152,27 @@ def test_trajectories_are_whole_episodes_of_the_study(study, name):
 def test_every_checkpoint_plays_as_many_episodes(study):
     rows = metrics(study / "smoke" / "02_collect" / "seed0")
     teacher = SETS["teacher_train"] + SETS["teacher_validation"]
-    assert [int(row["episodes"]) for row in rows] == [24, 24, 24 + teacher]
+    drifting = (SETS["train"] + SETS["validation"]) // 2 // 3
+    assert [int(row["episodes"]) for row in rows] == [24 - drifting, 24 - drifting, 24 - drifting + teacher]
+
+
+def test_a_drifting_player_sees_the_box_off_its_pose_in_the_last_worlds():
+    collect = importlib.import_module("02_collect")
+    env = collect.Drifting(PushVectorEnv(600), 400)
+    errors, obs = [], env.reset(seed=3)[0]
+    for _ in range(task.HORIZON - 1):  # no world ends before
+        errors.append(task.unscale_pose(obs[:, :4]) - env.unwrapped.box)
+        assert (obs[:, 4:] == task.scale(env.unwrapped.state)[:, 4:]).all()
+        obs = env.step(np.full((600, 2), 5))[0]
+    errors = np.array(errors)
+    errors[..., 2] = task.wrap(errors[..., 2])
+    assert np.abs(errors[:, :200]).max() < 1e-5
+    assert errors[60:, 200:].std((0, 1)) == pytest.approx(collect.DRIFT / 3**0.5, rel=0.1)  # sizes are uniform
+    later = int(collect.DRIFT_TIME * task.RATE)
+    kept = (errors[60:-later] * errors[60 + later:])[:, 200:].mean((0, 1)) / errors[60:, 200:].var((0, 1))
+    assert kept == pytest.approx(np.full(3, np.exp(-1)), abs=0.1)
+    again = collect.Drifting(PushVectorEnv(600), 400)
+    assert (again.reset(seed=3)[0] == env.reset(seed=3)[0]).all()
 
 
 def test_inputs_are_recorded(study):
@@ -212,6 +233,26 @@ def test_a_second_run_does_nothing(study, call):
         assert code == 0 and not stderr
         assert stdout.count("finished already (--force redoes it)") == sum(script in folder for folder in OUTPUTS)
     assert written() == before
+
+
+def test_published_nets_are_evaluated_as_in_their_study(study, call, tmp_path):
+    published = tmp_path / "published"
+    for pattern in ("01_*/seed0/policy.safetensors", "02_*/seed0/test_*.npy", "03_*/*/seed0/estimator.safetensors",
+                    "04_*/*/seed0/policy.safetensors"):
+        for path in (study / "smoke").glob(pattern):
+            folder = published / path.parent.relative_to(study / "smoke")
+            folder.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, folder), shutil.copy(path.parent / "config.json", folder)
+    out, name = tmp_path / "runs", "smoke/05_evaluate/seed0/results.json"
+    assert call(out, "05_evaluate", "--weights", str(published))[2] == 0
+    assert json.loads((out / name).read_text())["success_rate"] == json.loads((study / name).read_text())["success_rate"]
+    assert call(out, "06_robot", "--scenario", "natural", "--weights", str(published))[2] == 0
+    assert {path.name for path in (out / "smoke").iterdir()} == {"05_evaluate", "06_robot"}
+    assert not any(str(tmp_path) in path.read_text() for path in out.rglob("config.json"))
+
+    shutil.rmtree(published / "03_train_estimator")
+    for script in "05_evaluate", "06_robot":
+        assert is_mistake(*call(out, script, "--weights", str(published)), "missing", f"--weights {published}", "study")
 
 
 # Stopped and resumed

@@ -60,6 +60,17 @@ def test_batches_take_every_trajectory_once():
     assert [len(batch) for batch in taken] == [4, 4, 2] and np.concatenate(taken).tolist() == order.tolist()
 
 
+def test_shuffled_batches_take_every_trajectory_once_and_pad_little():
+    rng = np.random.default_rng(0)
+    lengths = rng.integers(1, 300, 1000)
+    data = np.zeros((lengths.sum(), 7), np.float32), np.concatenate([[0], lengths.cumsum()])
+    one, other = trajectories.shuffled(data, 8, rng), trajectories.shuffled(data, 8, rng)
+    assert sorted(np.concatenate(one)) == sorted(np.concatenate(other)) == list(range(1000)) and {len(b) for b in one} == {8}
+    assert sum(len(b) * lengths[b].max() for b in one) < 1.1 * lengths.sum()
+    first = [lengths[b].max() for b in one]
+    assert abs(np.corrcoef(first[:-1], first[1:])[0, 1]) < 0.3 and {tuple(b) for b in one} != {tuple(b) for b in other}
+
+
 @pytest.mark.parametrize("count, indices", [(1, [0]), (2, [0, 3]), (4, [0, 1, 2, 3]), (9, [0, 1, 2, 3])])
 def test_a_subset_is_spread_over_the_checkpoints(data, count, indices):
     assert trajectories.subset(data, count).tolist() == indices
