@@ -51,7 +51,8 @@ class Hyperparameters:
     tolerance: float = 1.0
     """aid: first factor on the success tolerance, lowered by 5 % after 512 episodes of which 60 % succeed; 1 is none"""
     near_share: float = 0.0
-    """aid: share of training episodes that start with the box nearer to the target and the pusher beside it; 0 is none"""
+    """aid: share of training episodes that start with the box nearer to the target and the pusher beside it, until the
+    tolerance has come down to 1; 0 is none"""
     eval_every: int = 20
     """updates between measurements of the success rate (study's starts, 1x tolerance, worlds that no update sees)"""
     eval_episodes: int = 500
@@ -277,7 +278,7 @@ def train(run, hp, make_env, actor, critic, keep=None):
     device = next(actor.parameters()).device
     env, held_out = make_env(hp.num_envs), make_env(hp.eval_episodes)
     aids = env.unwrapped
-    aids.tolerance, aids.near_share = hp.tolerance, hp.near_share
+    aids.tolerance = hp.tolerance
     optimizers = [torch.optim.Adam(net.parameters(), lr=hp.lr, eps=1e-5) for net in (actor, critic)]
     first, ended, successes = 0, 0, 0
     if state := run.load_resume():
@@ -313,6 +314,7 @@ def train(run, hp, make_env, actor, critic, keep=None):
             torch.manual_seed(draw)
             obs, _ = env.reset(seed=draw)
             carry = obs, actor.initial(hp.num_envs, device), critic.initial(hp.num_envs, device)
+        aids.near_share = hp.near_share if aids.tolerance > 1 else 0.0
         batch, carry = rollout(env, actor, critic, carry, hp.rollout_steps)
         seq = sequences(batch, critic, hp.gamma, hp.lam)
         stats = update(actor, critic, optimizers, seq, hp) | {"explained": seq["explained"]}
