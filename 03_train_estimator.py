@@ -11,7 +11,7 @@ from typing import Literal
 
 import torch
 
-from common import artifacts, networks, plots, supervised, trajectories
+from common import artifacts, networks, plots, supervised, tables, trajectories
 
 METHODS = ("ours", "likelihood", "mse")
 GRID = (1, 2, 5, 10, 20, 50)  # of M, for the error against M
@@ -74,7 +74,7 @@ def error_against_passes(estimator, data, cfg, device):
                 return estimator.predict(o, passes=passes)[0]
         return poses
 
-    return {m: trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, predict(m)) for m in GRID}
+    return {m: tables.error_table(trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, predict(m))) for m in GRID}
 
 
 def main(cfg):

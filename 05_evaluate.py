@@ -134,8 +134,7 @@ def estimator_errors(cfg, players, test, kind):
             return players.estimator(kind).predict(o, passes=cfg.passes)[0]
 
     torch.manual_seed(LIST + cfg.seed)
-    errors = trajectories.measure(test, cfg.test, 100, LIST + cfg.seed, players.device, predict)
-    return json.loads(json.dumps(errors, default=float))
+    return tables.error_table(trajectories.measure(test, cfg.test, 100, LIST + cfg.seed, players.device, predict))
 
 
 def report(run):
@@ -146,7 +145,7 @@ def report(run):
         raise artifacts.UserError(f"{run.dir}/results.json is missing or damaged: rerun with --force") from None
     if run.cfg.preset == "pretrained":
         print(f"\n{run.cfg.episodes} episodes a point, a quick look: the published tables, of 2,000, are in results/")
-    print(f"\n{tables.estimator_ablation(results)}\n\n{tables.success_rate(results)}\n")
+    print(f"\n{tables.beside_paper(results)}\n\n{tables.success_rate(results)}\n")
     print(f"figures, film, tables.md and results.json: {run.dir}")
 
 
@@ -203,7 +202,7 @@ def main(cfg):
 
     results = tables.summarise(done)
     artifacts.save_json(run.dir / "results.json", results)
-    sections = (tables.estimator_ablation, tables.success_rate, tables.occlusion_duration, tables.further)
+    sections = (tables.beside_paper, tables.estimator_ablation, tables.success_rate, tables.occlusion_duration, tables.further)
     text = "\n\n".join(section(results) for section in sections) + "\n"
     artifacts.write_atomic(run.dir / "tables.md", lambda path: path.write_text(text))
     artifacts.save_json(run.dir / "results.json", results | draw(run, players, results, done))

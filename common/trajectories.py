@@ -1,4 +1,4 @@
-"""Stored trajectories of clean states: memory-mapped arrays, padded batches, and the errors of tab. estimator_ablation."""
+"""Stored trajectories of clean states: memory-mapped arrays, padded batches, and the errors of estimates on them."""
 import numpy as np
 import torch
 
@@ -77,39 +77,27 @@ def observe(data, index, seed, device, occlusion=None):
 
 
 def pose_errors(q_hat, q, occluded, mask):
-    """Errors of scaled poses (T, B, 4), pooled over the valid steps (tab. estimator_ablation).
+    """Errors of scaled poses (T, B, 4), summed over the valid steps of each trajectory.
 
     Args:
         q_hat, q: estimated and true poses; occluded, mask: (T, B).
     Returns:
-        {"all" | "seen" | "occluded": sums over steps of (1, |d_xy|, |d_xy|^2, |d_theta|, d_theta^2) in m and rad}, to add up
-        over batches before `error_table`.
+        {"all" | "seen" | "occluded": (5, B) sums of (1, |d_xy|, |d_xy|^2, |d_theta|, d_theta^2) in m and rad}.
     """
     q_hat, q = (task.unscale_pose(x.double().cpu().numpy()) for x in (q_hat, q))
     occluded, mask = occluded.cpu().numpy() > 0, mask.cpu().numpy() > 0
     l2 = np.linalg.norm(q_hat[..., :2] - q[..., :2], axis=-1)
     angle = np.abs(task.wrap(q_hat[..., 2] - q[..., 2]))
     terms = np.stack([np.ones_like(l2), l2, l2**2, angle, angle**2])
-    return {name: terms[:, chosen].sum(1) for name, chosen in
+    return {name: (terms * chosen).sum(1) for name, chosen in
             {"all": mask, "seen": mask & ~occluded, "occluded": mask & occluded}.items()}
-
-
-def error_table(sums):
-    """Sums of `pose_errors` as the table's numbers: mean L2 and per-axis RMSE in mm, mean abs. and RMSE in degrees."""
-    def row(s):
-        l2, l2_2, angle, angle_2 = s[1:] / max(s[0], 1)
-        return {"trans_mean_l2_mm": 1e3 * l2, "trans_rmse_mm": 1e3 * np.sqrt(l2_2 / 2),
-                "rot_mean_abs_deg": np.rad2deg(angle), "rot_rmse_deg": np.rad2deg(np.sqrt(angle_2))}
-
-    return row(sums["all"]) | {name: row(sums[name]) for name in ("seen", "occluded")}
 
 
 @torch.no_grad()
 def measure(data, count, size, seed, device, predict, occlusion=None):
-    """Error table of predict(o) -> scaled poses (T, B, 4) over `count` trajectories, the same noise for every predict."""
-    total = {}
+    """`pose_errors` of predict(o) -> scaled poses (T, B, 4) over `count` trajectories, the same noise for every predict."""
+    parts = []
     for k, index in enumerate(batches(subset(data, count), size)):
         o, s, mask = observe(data, index, (seed, 0, k, 3), device, occlusion)
-        for name, sums in pose_errors(predict(o), s[..., :4], o[..., 8], mask).items():
-            total[name] = total.get(name, 0) + sums
-    return error_table(total)
+        parts.append(pose_errors(predict(o), s[..., :4], o[..., 8], mask))
+    return {name: np.concatenate([part[name] for part in parts], 1) for name in parts[0]}

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from common import artifacts, networks, ppo, stacks, task, trajectories
+from common import artifacts, networks, ppo, stacks, tables, task, trajectories
 from common.env import PushVectorEnv
 
 ROOT = Path(__file__).parent.parent
@@ -213,8 +213,10 @@ def test_the_ablation_is_measured_on_the_test_set(study):
     f = networks.load_estimator(study / "smoke/03_train_estimator/mse/seed0/estimator.safetensors")
     results = json.loads((study / "smoke/05_evaluate/seed0/results.json").read_text())["estimator_ablation"]
     for name, predict in ("vision", lambda o: o[..., :4]), ("mse", lambda o: f(o)[0]):
-        table = trajectories.measure(test, 12, 100, draws, "cpu", predict)
-        assert {key: results[name][key] for key in table} == {key: pytest.approx(x, rel=0.02) for key, x in table.items()}
+        table = tables.error_table(trajectories.measure(test, 12, 100, draws, "cpu", predict))
+        for part in ("half_95", "seen", "occluded"):
+            assert results[name][part].keys() == table[part].keys()
+        assert [results[name][key] for key in tables.ERRORS] == pytest.approx([table[key] for key in tables.ERRORS], rel=0.02)
 
 
 def test_the_film_plays(study):
