@@ -302,6 +302,7 @@ def train(run, hp, make_env, actor, critic, keep=None):
             bar.set_postfix_str(f"success {success:.1%}, tolerance {aids.tolerance:.2f}x, {rate:,.0f} steps/s")
         if k == hp.updates:
             break
+        aids.near_share = hp.near_share if aids.tolerance > 1 else 0.0
         if k % hp.resume_every == 0:  # all worlds start anew here, in an uninterrupted run too
             if k > first:
                 run.save_resume(dict(update=k, actor=actor.state_dict(), critic=critic.state_dict(),
@@ -314,7 +315,6 @@ def train(run, hp, make_env, actor, critic, keep=None):
             torch.manual_seed(draw)
             obs, _ = env.reset(seed=draw)
             carry = obs, actor.initial(hp.num_envs, device), critic.initial(hp.num_envs, device)
-        aids.near_share = hp.near_share if aids.tolerance > 1 else 0.0
         batch, carry = rollout(env, actor, critic, carry, hp.rollout_steps)
         seq = sequences(batch, critic, hp.gamma, hp.lam)
         stats = update(actor, critic, optimizers, seq, hp) | {"explained": seq["explained"]}
