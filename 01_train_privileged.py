@@ -55,9 +55,8 @@ def main(cfg):
     networks.save_recurrent(run.dir / "policy.safetensors", pi_priv)
     networks.save_recurrent(run.dir / "value.safetensors", critic)
     plots.success_rate_priv(run.dir.parent, run.dir / "success_rate_priv.png")
-    last = run.rows()[-1]
-    run.finish(["policy.safetensors", "value.safetensors", *names], steps=int(last["steps"]), success=last["success"])
-    print(f"{run.dir}: pi_priv succeeds in {last['success']:.1%} of held-out episodes")
+    run.finish(["policy.safetensors", "value.safetensors", *names], **ppo.outcome(run))
+    print(f"{run.dir}: pi_priv succeeds in {run.record['success']:.1%} of held-out episodes")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 Reads the checkpoints of 01. Writes runs/<preset>/02_collect/seed<k>/: for the sets train, validation, test (all checkpoints,
 the same number of whole episodes each) and teacher_train, teacher_validation (the last checkpoint) <set>_states.npy
 (steps, 7) float32 in SI units and <set>_offsets.npy (n + 1,); metrics.csv and success.png of the checkpoints. With --drifting,
-a share of train and validation is played by checkpoints that see the box where it is not.
+a share of train and validation is played by checkpoints that see the box where it is not (their success is left out).
 """
 import time
 from dataclasses import dataclass
@@ -49,14 +49,14 @@ class Drifting(gym.vector.VectorWrapper):
     """A PushVectorEnv whose last `count` worlds show the box off its pose, by a random error of another size in each.
 
     A player that believes it moves as one that acts on an estimate: its motion does not betray the true pose. The error is an
-    Ornstein-Uhlenbeck process.
+    Ornstein-Uhlenbeck process that begins small. For the first episode of each world, which is what is collected.
     """
 
     def __init__(self, env, count):
         super().__init__(env)
         self.count = count
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, *, seed, options=None):
         _, infos = self.env.reset(seed=seed, options=options)
         self.rng = np.random.default_rng([seed, 2])
         self.size = self.rng.random((self.num_envs, 1)) * DRIFT
@@ -84,8 +84,8 @@ def jobs(cfg, checkpoints):
         share = [count * (i + 1) // len(players) - count * i // len(players) for i in range(len(players))]
         for player, part in zip(players, share):
             for first in range(0, part, cfg.num_envs):
-                count = min(cfg.num_envs, part - first)
-                yield name, player, count, round(cfg.drifting * count) if name in ("train", "validation") else 0
+                worlds = min(cfg.num_envs, part - first)
+                yield name, player, worlds, round(cfg.drifting * worlds) if name in ("train", "validation") else 0
 
 
 def collect(policy, num_envs, seed, drifting=0):

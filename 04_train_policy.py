@@ -131,12 +131,12 @@ def main(cfg):
         networks.save_recurrent(run.dir / "policy.safetensors", pi)
         if method == "behavior_cloning":
             plots.validation_loss(run.dir.parent.parent, "bc_loss", run.dir / "bc_loss.png")
-            card = dict(epochs=len(run.rows()), validation_loss=min(row["validation_loss"] for row in run.rows()))
+            run.finish(["policy.safetensors"], **supervised.outcome(run))
+            print(f"{run.dir}: validation loss {run.record['validation_loss']:.4f}")
         else:
             plots.success_rate(run.dir.parent.parent, run.dir / "success_rate.png")
-            card = dict(steps=int(run.rows()[-1]["steps"]), success=run.rows()[-1]["success"])
-        run.finish(["policy.safetensors"], **card)
-        print(f"{run.dir}: " + ", ".join(f"{name.replace('_', ' ')} {value:,}" for name, value in card.items()))
+            run.finish(["policy.safetensors"], **ppo.outcome(run))
+            print(f"{run.dir}: succeeds in {run.record['success']:.1%} of held-out episodes")
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
     python 05_evaluate.py [pretrained|smoke|quick|laptop|paper] [--weights DIR] [--episodes n] [--seed k] [--field value ...]
 
-Reads pi_priv (01), the test set (02), the estimators (03) and every finished seed of the policies (04): of the same preset, or
-in the folder --weights, which is pretrained/ with the preset pretrained. Writes runs/<preset>/05_evaluate/seed<k>/:
+Reads pi_priv (01), the test set (02), the estimators (03), every finished seed of the policies (04) and their metrics.csv: of the
+same preset, or in the folder --weights, which is pretrained/ with the preset pretrained. Writes runs/<preset>/05_evaluate/seed<k>/:
 results.json, tables.md, success_rate.png, occlusion_duration.png, trajectory_with_uncertainty.png, sim.png and film.mp4,
 film.gif. Resumes after the last finished measurement.
 """
@@ -43,7 +43,7 @@ class Config(artifacts.Reader):
 
 PRESETS = {
     "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, passes=10, num_envs=200,
-                       weights=Path("pretrained")),
+                       weights=Path(__file__).parent / "pretrained"),
     "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, passes=2, test=12, num_envs=16),
     "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, passes=20, test=2000, num_envs=300),
     "laptop": dict(switch_episodes=2000, passes=10, num_envs=1000),
@@ -85,7 +85,7 @@ def policy_of(method):
 def finished_seeds(cfg, method):
     """Seed 0 and every other seed of a policy whose training is finished."""
     stage, _, name = policy_of(method)
-    folders = {int(folder.name[4:]): folder for folder in artifacts.run_folder(cfg.root, stage, name, 0).parent.glob("seed*")}
+    folders = {int(folder.name[4:]): folder for folder in artifacts.run_folder(cfg.source, stage, name, 0).parent.glob("seed*")}
     return sorted({0} | {k for k, folder in folders.items() if (artifacts.record_of(cfg, folder) or {}).get("finished")})
 
 
@@ -141,18 +141,19 @@ def report(run):
     """Prints the two tables and the folder of the figures."""
     try:
         results = json.loads((run.dir / "results.json").read_text())
-    except (OSError, ValueError):
-        raise artifacts.UserError(f"{run.dir}/results.json is missing or damaged: rerun with --force") from None
+        text = f"{tables.beside_paper(results)}\n\n{tables.success_rate(results)}"
+    except (OSError, ValueError, KeyError):
+        raise artifacts.UserError(f"{run.dir}/results.json is missing, damaged or old: rerun with --force") from None
     if run.cfg.preset == "pretrained":
-        print(f"\n{run.cfg.episodes} episodes a point, a quick look: the published tables, of 2,000, are in results/")
-    print(f"\n{tables.beside_paper(results)}\n\n{tables.success_rate(results)}\n")
+        print(f"\nA quick look, {run.cfg.episodes} episodes a point: the published tables and figures are in results/")
+    print(f"\n{text}\n")
     print(f"figures, film, tables.md and results.json: {run.dir}")
 
 
 def draw(run, players, results, done):
     """Every figure, and the film; returns which episodes they show."""
     levels = {m: results["success_rate"][m]["mean"] for m in ("priv_on_estimate", "behavior_cloning")}
-    plots.success_rate(run.cfg.root / "04_train_policy", run.dir / "success_rate.png", levels)
+    plots.success_rate(run.cfg.source / "04_train_policy", run.dir / "success_rate.png", levels)
     plots.occlusion_duration(results["occlusion_duration"], run.dir / "occlusion_duration.png")
     plots.sim(run.dir / "sim.png")
 

@@ -47,11 +47,11 @@ class Config(hardware.Gaps, artifacts.Reader):
     """device number, file or address of a camera that OpenCV opens, instead of the arm's own"""
     print_tags: bool = False
     """write the sheet of tags for the box, and nothing else"""
-    free: ClassVar = ("weights", "scenario", "runs", "video", "realtime", "print_tags")
+    free: ClassVar = (*artifacts.Reader.free, "scenario", "runs", "video", "realtime", "print_tags")
 
 
 PRESETS = {
-    "pretrained": dict(weights=Path("pretrained"), runs=10, passes=10),
+    "pretrained": dict(weights=Path(__file__).parent / "pretrained", runs=10, passes=10),
     "smoke": dict(runs=1, passes=2),
     "quick": dict(runs=1, passes=20),
     "laptop": dict(runs=100, passes=10),

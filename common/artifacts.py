@@ -55,7 +55,7 @@ class Stage:
         return self.out / self.preset
 
     @property
-    def root(self) -> Path:
+    def source(self) -> Path:
         """Folder that the run folders of earlier stages lie in."""
         return self.own
 
@@ -66,16 +66,16 @@ class Reader(Stage):
 
     free: ClassVar = ("weights",)
     weights: Path | None = None
-    """folder to read instead of <out>/<preset>, of a finished study or of what it published: pretrained"""
+    """read the earlier stages in this folder, laid out as <out>/<preset>, instead of there"""
 
     @property
-    def root(self) -> Path:
+    def source(self) -> Path:
         return self.weights or self.own
 
 
-def run_folder(root: Path, stage: str, method: str | None, seed: int) -> Path:
-    """A run folder."""
-    return root / stage / (method or "") / f"seed{seed}"
+def run_folder(study: Path, stage: str, method: str | None, seed: int) -> Path:
+    """<study>/<stage>/[method/]seed<k>."""
+    return study / stage / (method or "") / f"seed{seed}"
 
 
 def parse(config_class: type, presets: dict[str, dict], doc: str, args: list[str]):
@@ -146,9 +146,8 @@ def save_json(path: Path, obj):
     write_atomic(path, lambda temporary: temporary.write_text(text + "\n"))
 
 
-def save_tensors(path: Path, tensors: dict[str, torch.Tensor] | torch.nn.Module, **meta):
+def save_tensors(path: Path, tensors: dict[str, torch.Tensor], **meta):
     """Writes a safetensors file; meta is anything that JSON holds."""
-    tensors = tensors.state_dict() if isinstance(tensors, torch.nn.Module) else tensors
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     data = safetensors.torch.save(tensors, {"meta": json.dumps(meta)})  # one key: safetensors shuffles several
     write_atomic(path, lambda temporary: temporary.write_bytes(data))
@@ -172,7 +171,7 @@ def digest(path: Path) -> dict:
 def remedy(cfg: Stage, folder: Path, more: str = "") -> str:
     """What to do about a run folder: run python 0N_name.py preset [--method m] [--seed k] [--out root]."""
     if not folder.is_relative_to(cfg.own):
-        return f"--weights {cfg.root} is not, or no longer, the folder of a finished study"
+        return f"--weights {cfg.source} is not, or no longer, the folder of a finished study"
     stage, *method, seed = folder.relative_to(cfg.own).parts
     method = f" --method {method[0]}" if method else ""
     seed = f" --seed {seed[4:]}" if seed != "seed0" else ""
@@ -190,7 +189,7 @@ def record_of(cfg: Stage, folder: Path) -> dict | None:
 
 def find(cfg: Stage, stage: str, name: str, method: str | None = None, seed: int = 0) -> Path:
     """Path of an earlier stage's artifact: finished, whole (above 64 MiB: of the right size), and not stale."""
-    folder = run_folder(cfg.root, stage, method, seed)
+    folder = run_folder(cfg.source, stage, method, seed)
     path, record = folder / name, record_of(cfg, folder)
     if not record or not record["finished"]:
         raise UserError(f"{path} is {'unfinished' if record else 'missing'}: {remedy(cfg, folder, ' first')}")
@@ -203,10 +202,10 @@ def find(cfg: Stage, stage: str, name: str, method: str | None = None, seed: int
 
 
 def recorded(cfg: Stage, key: str) -> tuple[Path, dict | None, str | None]:
-    """Run folder, record and sha256 of an artifact given by its path relative to the root."""
+    """Run folder, record and sha256 of an artifact given by its path relative to the study's folder."""
     place, name = re.fullmatch(r"(.+?/seed\d+)/(.+)", key).groups()
-    record = record_of(cfg, cfg.root / place)
-    return cfg.root / place, record, record and record["outputs"].get(name, {}).get("sha256")
+    record = record_of(cfg, cfg.source / place)
+    return cfg.source / place, record, record and record["outputs"].get(name, {}).get("sha256")
 
 
 def check_fresh(cfg: Stage, folder: Path, record: dict):
@@ -227,7 +226,7 @@ class Run:
         self.began, self.minutes_before, self.logged, self.columns = time.monotonic(), 0.0, 0, []
         words = [re.sub(r"(^|=)[/~].*/(?=.)", r"\1", word) for word in sys.argv]  # absolute paths lose their folder
         settings = {name: value for name, value in asdict(cfg).items() if name == "seed" or not hasattr(Stage, name) and name not in cfg.free}
-        keys = (path.relative_to(cfg.root).as_posix() for path in inputs.values())
+        keys = (path.relative_to(cfg.source).as_posix() for path in inputs.values())
         self.record = {
             "command": " ".join(["python", Path(words[0]).name, *words[1:]]),
             "versions": {"python": sys.version.split()[0]}
@@ -244,11 +243,11 @@ class Run:
         save_json(self.dir / "config.json", self.record)
 
     def compare(self, before: dict):
-        for part, remedy in {"settings": "use --force, or another --out", "inputs": "use --force"}.items():
+        for part in ("settings", "inputs"):
             old, new = before[part], self.record[part]
             if other := [key for key in {**old, **new} if old.get(key) != new.get(key)]:
                 words = [f"{key} {old.get(key)} -> {new.get(key)}" if part == "settings" else key for key in other]
-                raise UserError(f"{self.dir}: {part} changed since it was begun ({', '.join(words)}): {remedy}")
+                raise UserError(f"{self.dir}: {part} changed since it was begun ({', '.join(words)}): use --force, or another --out")
 
     def skip(self) -> bool:
         """True, said aloud, if there is nothing to do."""

@@ -102,9 +102,10 @@ class EvenLSTM(nn.LSTM):
 
     def __init__(self, inputs, size):
         super().__init__(inputs + inputs % 2, size)
+        self.odd = inputs % 2
 
     def forward(self, x, hidden=None):
-        return super().forward(F.pad(x, (0, self.input_size - x.shape[-1])), hidden)
+        return super().forward(F.pad(x, (0, self.odd)), hidden)
 
 
 class Estimator(nn.Module):
@@ -176,8 +177,7 @@ def save_recurrent(path, net):
 
 
 def load_recurrent(path, device="cpu"):
-    tensors, meta = artifacts.load_tensors(path)
-    return _filled(Recurrent(**meta), tensors, device)
+    return _load(Recurrent, path, device)
 
 
 def save_estimator(path, net):
@@ -186,10 +186,14 @@ def save_estimator(path, net):
 
 
 def load_estimator(path, device="cpu"):
+    return _load(Estimator, path, device)
+
+
+def _load(kind, path, device):
     tensors, meta = artifacts.load_tensors(path)
-    return _filled(Estimator(**meta), tensors, device)
-
-
-def _filled(net, tensors, device):
-    net.load_state_dict({name: x.float() for name, x in tensors.items()})
+    try:
+        net = kind(**meta)
+        net.load_state_dict({name: x.float() for name, x in tensors.items()})
+    except (TypeError, RuntimeError):
+        raise artifacts.UserError(f"{path} holds another net than expected: rerun its stage with --force") from None
     return net.to(device).requires_grad_(False)

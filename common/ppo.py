@@ -326,3 +326,9 @@ def train(run, hp, make_env, actor, critic, keep=None):
         played += hp.num_envs * hp.rollout_steps
         bar.update()
     return True
+
+
+def outcome(run):
+    """What config.json keeps of a finished training: steps played, and success at the end."""
+    last = run.rows()[-1]
+    return {"steps": int(last["steps"]), "success": last["success"]}

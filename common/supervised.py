@@ -58,3 +58,9 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
             run.stop()
             return False
     return True
+
+
+def outcome(run):
+    """What config.json keeps of a finished training: its epochs, and the loss of the epoch that was saved."""
+    losses = [row["validation_loss"] for row in run.rows()]
+    return {"epochs": len(losses), "validation_loss": min(losses)}

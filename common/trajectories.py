@@ -53,7 +53,7 @@ def batches(indices, size):
 def shuffled(data, size, rng):
     """Indices of all trajectories in batches of `size` in random order; those of a batch are of similar length."""
     lengths = np.diff(data[1])
-    pools = [pool[lengths[pool].argsort()] for pool in batches(rng.permutation(len(lengths)), POOL * size)]
+    pools = [pool[lengths[pool].argsort(kind="stable")] for pool in batches(rng.permutation(len(lengths)), POOL * size)]
     parts = [part for pool in pools for part in batches(pool, size)]
     return [parts[i] for i in rng.permutation(len(parts))]
 

@@ -56,7 +56,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
 
 def test_tensors_and_their_meta_come_back(tmp_path):
     net, path = torch.nn.Linear(2, 3), tmp_path / "net.safetensors"
-    artifacts.save_tensors(path, net, method="ours", widths=[1, 2])
+    artifacts.save_tensors(path, net.state_dict(), method="ours", widths=[1, 2])
     tensors, meta = artifacts.load_tensors(path)
     assert meta == {"method": "ours", "widths": [1, 2]}
     assert torch.equal(tensors["weight"], net.weight)

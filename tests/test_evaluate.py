@@ -127,6 +127,9 @@ def test_results_have_the_published_layout():
     for points in results["occlusion_duration"].values():
         assert list(points) == ["0", "2.5", "5", "10", "full"]
         assert all(set(p) == {"mean", "low", "high", "episodes"} and p["episodes"] == 20 for p in points.values())
+    done = made_up()
+    lost = np.mean(done["occlusion_duration/est/0"]) - np.mean(done["occlusion_duration/est/full"])
+    assert results["occlusion_loss"]["est"]["mean"] == pytest.approx(lost)
     assert set(results["contact_switches"]["priv_on_state"]) == {"mean", "std", "episodes"}
     assert set(results["whole_workspace_starts"]) == {"priv_on_state", "est_uncertainty"}
 

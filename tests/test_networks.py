@@ -126,6 +126,17 @@ def test_without_dropout_the_head_is_tanh_layers():
     torch.testing.assert_close(torch.cat(f.head(z), -1), c(torch.tanh(b(torch.tanh(a(z))))))
 
 
+def test_forget_gates_begin_open():
+    gates = (f := small()).lstm.bias_ih_l0.view(4, 16)  # input, forget, cell, output
+    assert (gates[1] == 1).all() and (gates[[0, 2, 3]].abs() <= 16**-0.5).all()
+
+
+@pytest.mark.parametrize("width", [8, 10, 12])
+def test_an_estimator_takes_nothing_but_observations(width):
+    with pytest.raises(RuntimeError, match="input"):
+        small()(torch.zeros(3, 2, width))
+
+
 def test_a_tenth_input_is_zero_and_changes_nothing():
     f, plain = small(dropout=0.0), nn.LSTM(9, 16)
     plain.load_state_dict({name: x[:, :9] if name == "weight_ih_l0" else x for name, x in f.lstm.state_dict().items()})
@@ -197,6 +208,7 @@ def test_nets_come_back_from_files(tmp_path):
         weights.data = weights.half().float()  # as the files hold them
     networks.save_recurrent(policy := tmp_path / "policy.safetensors", net)
     networks.save_estimator(estimator := tmp_path / "estimator.safetensors", f)
+    assert {x.dtype for path in (policy, estimator) for x in artifacts.load_tensors(path)[0].values()} == {torch.float16}
     again, f_again = networks.load_recurrent(policy), networks.load_estimator(estimator)
     x = torch.randn(3, 2, 12)
     assert again(x)[0].equal(net(x)[0]) and not again.encoder.weight.requires_grad
@@ -208,3 +220,9 @@ def test_a_damaged_net_is_a_users_error(tmp_path):
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(artifacts.UserError, match="policy.safetensors is missing or damaged"):
         networks.load_recurrent(path)
+
+
+def test_another_net_than_expected_is_a_users_error(tmp_path):
+    artifacts.save_tensors(path := tmp_path / "estimator.safetensors", networks.value(8, (8, 6, 4)).state_dict(), sizes=(8, 6, 4))
+    with pytest.raises(artifacts.UserError, match="another net than expected: rerun its stage"):
+        networks.load_estimator(path)

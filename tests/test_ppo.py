@@ -1,3 +1,4 @@
+import importlib
 from dataclasses import replace
 
 import gymnasium as gym
@@ -7,6 +8,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from common import networks, ppo, task
+from common.env import PushVectorEnv
 
 HP = ppo.Hyperparameters(minibatch=10**6, epochs=1)
 bfloat16 = pytest.mark.skipif(not torch.cpu._is_avx512_bf16_supported(), reason="this machine does not compute in bfloat16")
@@ -276,6 +278,21 @@ def test_gradients_are_clipped_apart():
                       for net, old in zip(both, before)])
     torch.testing.assert_close(moved[0][0], moved[1][0])
     assert [step.norm().item() for pair in moved for step in pair] == pytest.approx([0.01] * 4, rel=1e-3)
+
+
+def test_near_starts_end_when_the_tolerance_has_come_down(monkeypatch, tmp_path):
+    stage, shares, reset = importlib.import_module("01_train_privileged"), [], PushVectorEnv.reset
+
+    def record(env, **kw):
+        shares.append((env.num_envs, env.near_share))
+        return reset(env, **kw)
+
+    monkeypatch.setattr(PushVectorEnv, "reset", record)
+    monkeypatch.setattr(task, "reached", lambda box, tolerance=1.0: np.ones(len(box), bool))  # 512 successes an update
+    changes = dict(tolerance=1.04, near_share=0.5, updates=3, resume_every=1)
+    stage.main(stage.Config(preset="smoke", out=tmp_path, device="cpu", **stage.PRESETS["smoke"] | changes))
+    assert [share for worlds, share in shares if worlds == 32] == [0.5, 0, 0]
+    assert {share for worlds, share in shares if worlds == 16} == {0}  # held-out episodes
 
 
 # Learning

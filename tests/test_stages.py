@@ -240,7 +240,7 @@ def test_a_second_run_does_nothing(study, call):
 def test_published_nets_are_evaluated_as_in_their_study(study, call, tmp_path):
     published = tmp_path / "published"
     for pattern in ("01_*/seed0/policy.safetensors", "02_*/seed0/test_*.npy", "03_*/*/seed0/estimator.safetensors",
-                    "04_*/*/seed0/policy.safetensors"):
+                    "04_*/*/seed0/policy.safetensors", "04_*/*/seed0/metrics.csv"):
         for path in (study / "smoke").glob(pattern):
             folder = published / path.parent.relative_to(study / "smoke")
             folder.mkdir(parents=True, exist_ok=True)
@@ -248,6 +248,8 @@ def test_published_nets_are_evaluated_as_in_their_study(study, call, tmp_path):
     out, name = tmp_path / "runs", "smoke/05_evaluate/seed0/results.json"
     assert call(out, "05_evaluate", "--weights", str(published))[2] == 0
     assert json.loads((out / name).read_text())["success_rate"] == json.loads((study / name).read_text())["success_rate"]
+    figures = (cv2.imread(str(root / "smoke/05_evaluate/seed0/success_rate.png")) for root in (out, study))
+    assert (next(figures) == next(figures)).all()
     assert call(out, "06_robot", "--scenario", "natural", "--weights", str(published))[2] == 0
     assert {path.name for path in (out / "smoke").iterdir()} == {"05_evaluate", "06_robot"}
     assert not any(str(tmp_path) in path.read_text() for path in out.rglob("config.json"))
@@ -339,6 +341,13 @@ def test_a_stale_input_names_the_stage_to_redo(copy, call):
     assert is_mistake(*call(out, "02_collect"), "inputs changed", "checkpoint_002.safetensors", "--force")
     assert is_mistake(*call(out, "03_train_estimator"), "stale", "run python 02_collect.py smoke", "--force")
     assert is_mistake(*call(out, "04_train_policy"), "stale", "--force")
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_every_preset_is_a_config(script):
+    module = importlib.import_module(script)
+    for preset in module.PRESETS:
+        assert artifacts.parse(module.Config, module.PRESETS, module.__doc__, [preset]).preset == preset
 
 
 def test_mistakes_on_the_command_line_are_one_line(tmp_path):
