@@ -44,7 +44,7 @@ PRESETS = {
                   eval_episodes=16, resume_every=2, warm_start=True, passes=2, bc_sequences=16, bc_epochs=2,
                   bc_validation=12),
     "quick": _QUICK | dict(updates=80, sizes=(64, 128, 64), passes=5, bc_sequences=25, bc_epochs=2, bc_validation=500),
-    "laptop": _QUICK | dict(updates=2000, passes=10, bc_sequences=32, bc_epochs=15, bc_validation=1000),
+    "laptop": _QUICK | dict(updates=1000, passes=10, bc_sequences=32, bc_epochs=6, bc_validation=1000),
     "paper": {},
 }
 
