@@ -51,8 +51,8 @@ class Hyperparameters:
     tolerance: float = 1.0
     """aid: first factor on the success tolerance, lowered by 5 % after 512 episodes of which 60 % succeed; 1 is none"""
     near_share: float = 0.0
-    """aid: share of training episodes that start with the box nearer to the target and the pusher beside it, until the
-    tolerance has come down to 1; 0 is none"""
+    """aid: share of training episodes that start with the box nearer to the target and the pusher beside it, falling to 0
+    over the training"""
     eval_every: int = 20
     """updates between measurements of the success rate (study's starts, 1x tolerance, worlds that no update sees)"""
     eval_episodes: int = 500
@@ -302,7 +302,7 @@ def train(run, hp, make_env, actor, critic, keep=None):
             bar.set_postfix_str(f"success {success:.1%}, tolerance {aids.tolerance:.2f}x, {rate:,.0f} steps/s")
         if k == hp.updates:
             break
-        aids.near_share = hp.near_share if aids.tolerance > 1 else 0.0
+        aids.near_share = hp.near_share * (1 - k / hp.updates)
         if k % hp.resume_every == 0:  # all worlds start anew here, in an uninterrupted run too
             if k > first:
                 run.save_resume(dict(update=k, actor=actor.state_dict(), critic=critic.state_dict(),
