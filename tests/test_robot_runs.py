@@ -154,7 +154,7 @@ class CtrlC(Faulty):
 FAULTS = {JointsNaN: "joint angles", WrenchNaN: "wrench", ImageTimeNaN: "camera", CameraFrozen: "frozen",
           CameraStuck: "camera: the newest is", CameraGone: "no image", WrenchOld: "wrench: the newest is", Forced: "over 40 N",
           JointAtLimit: "joint 4 is at its limit", Beyond: "beyond the border", JointsOld: "s old",
-          Lifted: "above its height", Broken: "BrokenPipeError in test_robot.py", CtrlC: "Ctrl-C"}
+          Lifted: "above its height", Broken: "BrokenPipeError in test_robot_runs.py", CtrlC: "Ctrl-C"}
 
 
 def stopped_for_good(arm):
