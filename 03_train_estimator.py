@@ -60,7 +60,8 @@ def train(run, cfg, train_set, validation_set, device):
         with networks.autocast(device):
             q_hat, log_var = f.head(f.lstm(o)[0][some])
         q, valid = s[some, :, :4], mask[some]
-        return networks.nll(q_hat, log_var, q, valid) if f.likelihood else networks.mse(q_hat, q, valid), mask.sum().item()
+        error = networks.nll(q_hat, log_var, q, valid) if f.likelihood else networks.mse(q_hat, q, valid)
+        return error, mask.sum().item()
 
     return supervised.fit(
         run, f, loss, lambda: networks.save_estimator(run.dir / "estimator.safetensors", f), train_set, validation_set,

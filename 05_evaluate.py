@@ -2,10 +2,10 @@
 
     python 05_evaluate.py [pretrained|smoke|quick|laptop|paper] [--weights DIR] [--episodes n] [--seed k] [--field value ...]
 
-Reads pi_priv (01), the test set (02), the estimators (03), every finished seed of the policies (04) and their metrics.csv: of the
-same preset, or in the folder --weights, which is pretrained/ with the preset pretrained. Writes runs/<preset>/05_evaluate/seed<k>/:
-results.json, tables.md, success_rate.png, occlusion_duration.png, trajectory_with_uncertainty.png, sim.png and film.mp4,
-film.gif. Resumes after the last finished measurement.
+Reads pi_priv (01), the test set (02), the estimators (03), every finished seed of the policies (04) and their metrics.csv:
+of the same preset, or in the folder --weights, which is pretrained/ with the preset pretrained. Writes
+runs/<preset>/05_evaluate/seed<k>/: results.json, tables.md, success_rate.png, occlusion_duration.png,
+trajectory_with_uncertainty.png, sim.png and film.mp4, film.gif. Resumes after the last finished measurement.
 """
 import json
 import math

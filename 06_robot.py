@@ -190,7 +190,7 @@ def perform(arm, f, pi, cfg, run, logs, scenario, k):
         with arm:
             ended = play(arm, f, pi, cfg, hand, rows)
     except safety.Stop as reason:
-        if isinstance(arm.arm, hardware.SimulatedArm) and str(reason).endswith("Ctrl-C"):
+        if isinstance(arm.arm, hardware.SimulatedArm) and isinstance(reason.__context__, KeyboardInterrupt):
             raise  # not the policy's failure: the same command plays the run again
         ended, stop = "stopped", reason
     log = runlog.log_of(rows, ended)

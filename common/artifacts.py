@@ -114,7 +114,8 @@ def main(config_class: type, presets: dict[str, dict], run: Callable, doc: str):
         sys.exit(141)
     except OSError as failure:
         # numpy gives no errno where the disk is full
-        if failure.errno not in (None, errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR):
+        if failure.errno not in (None, errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST,
+                                 errno.ENOTDIR):
             raise
         message, code = f"cannot write ({failure}): make room, or choose another --out", 2
     print("error:", " ".join(message.split()), file=sys.stderr)
@@ -225,7 +226,8 @@ class Run:
         self.cfg, self.dir = cfg, run_folder(cfg.own, stage, method, cfg.seed)
         self.began, self.minutes_before, self.logged, self.columns = time.monotonic(), 0.0, 0, []
         words = [re.sub(r"(^|=)[/~].*/(?=.)", r"\1", word) for word in sys.argv]  # absolute paths lose their folder
-        settings = {name: value for name, value in asdict(cfg).items() if name == "seed" or not hasattr(Stage, name) and name not in cfg.free}
+        settings = {name: value for name, value in asdict(cfg).items()
+                    if name == "seed" or not hasattr(Stage, name) and name not in cfg.free}
         keys = (path.relative_to(cfg.source).as_posix() for path in inputs.values())
         self.record = {
             "command": " ".join(["python", Path(words[0]).name, *words[1:]]),
@@ -247,7 +249,8 @@ class Run:
             old, new = before[part], self.record[part]
             if other := [key for key in {**old, **new} if old.get(key) != new.get(key)]:
                 words = [f"{key} {old.get(key)} -> {new.get(key)}" if part == "settings" else key for key in other]
-                raise UserError(f"{self.dir}: {part} changed since it was begun ({', '.join(words)}): use --force, or another --out")
+                raise UserError(f"{self.dir}: {part} changed since it was begun ({', '.join(words)}): "
+                                "use --force, or another --out")
 
     def skip(self) -> bool:
         """True, said aloud, if there is nothing to do."""

@@ -11,7 +11,7 @@ PAPER_ERRORS = {"vision": (49.83, 59.65, 22.56, 39.61), "mse": (7.62, 6.49, 2.51
                 "likelihood": (6.83, 5.92, 2.46, 3.39), "ours": (4.42, 3.84, 2.10, 2.96)}
 PAPER_SUCCESS = {"est_uncertainty": 94, "est": 92, "est_mse": 64, "priv_on_estimate": 83, "end_to_end": 12,
                  "behavior_cloning": 38}  # %
-PAPER_LOSS = {"est_uncertainty": 6.7, "est": 8.3, "end_to_end": 45.8, "behavior_cloning": 37.6}  # points, none to full occlusion
+PAPER_LOSS = {"est_uncertainty": 6.7, "est": 8.3, "end_to_end": 45.8, "behavior_cloning": 37.6}  # points, none to full
 PAPER_ROBOT = {"natural": "19/20", "hand_5s": "10/10", "hand_full": "7/10"}
 PAPER_SWITCHES = {"priv_on_state": "2.68 +- 1.53", "est_uncertainty": "4.22 +- 2.67"}
 
@@ -73,8 +73,9 @@ def summarise(done):
     for row in results["estimator_ablation"].values():
         vision = results["estimator_ablation"]["vision"]
         row |= {f"{key}_of_vision": row[key] / vision[key] for key in (ERRORS[0], ERRORS[2])}
-    results["occlusion_loss"] = {method: paired(done[f"occlusion_duration/{method}/0"], done[f"occlusion_duration/{method}/full"])
-                                 for method in results["occlusion_duration"]}
+    results["occlusion_loss"] = {
+        method: paired(done[f"occlusion_duration/{method}/0"], done[f"occlusion_duration/{method}/full"])
+        for method in results["occlusion_duration"]}
     by_seed = results["success_rate"]
     for method, values in list(by_seed.items()):
         row = wilson(values[0])
