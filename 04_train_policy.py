@@ -25,6 +25,8 @@ class Config(ppo.Hyperparameters, artifacts.Stage):
     """M, stochastic passes of the estimator in the loop (sec. 4)"""
     warm_start: bool = False
     """aid: the RL methods, end_to_end included, start from pi_priv's weights, new inputs at zero"""
+    privileged_critic: bool = False
+    """aid: the value net of the RL methods reads the true state too (Pinto et al. 2018); the policy does not"""
     bc_sequences: int = 100
     """behaviour cloning: trajectories per mini-batch (tab. estimator_hyperparameters)"""
     bc_epochs: int = 110
@@ -38,11 +40,11 @@ class Config(ppo.Hyperparameters, artifacts.Stage):
 
 
 _QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy=0.0005, kl_target=0.015, lr=3e-4,
-              lr_min=1e-4, lr_max=2e-3, warm_start=True, bc_lr=2e-3, bc_lr_end=5e-5)
+              lr_min=1e-4, lr_max=2e-3, warm_start=True, privileged_critic=True, bc_lr=2e-3, bc_lr_end=5e-5)
 PRESETS = {
     "smoke": dict(num_envs=32, rollout_steps=16, updates=4, minibatch=256, epochs=2, sizes=(16, 16, 16), eval_every=2,
-                  eval_episodes=16, resume_every=2, warm_start=True, passes=2, bc_sequences=16, bc_epochs=2,
-                  bc_validation=12),
+                  eval_episodes=16, resume_every=2, warm_start=True, privileged_critic=True, passes=2, bc_sequences=16,
+                  bc_epochs=2, bc_validation=12),
     "quick": _QUICK | dict(updates=80, sizes=(64, 128, 64), passes=5, bc_sequences=25, bc_epochs=2, bc_validation=500),
     "laptop": _QUICK | dict(updates=1000, passes=10, bc_sequences=32, bc_epochs=6, bc_validation=1000),
     "paper": {},
@@ -63,13 +65,13 @@ def inputs_of(cfg):
     return paths
 
 
-def start_from(net, trained):
-    """Copies pi_priv's (or its value net's) weights into a net with further inputs, whose weights become zero."""
+def start_from(net, trained, first=0):
+    """Copies pi_priv's (or its value net's) weights into a net that has its inputs from `first` on, and others: zero weights."""
     if net.sizes != tuple(trained.sizes):
         raise artifacts.UserError(f"--sizes {net.sizes}: pi_priv has {tuple(trained.sizes)}; use those, or --no-warm-start")
     weights = trained.state_dict()
     wide = torch.zeros_like(net.encoder.weight)
-    wide[:, :trained.inputs] = weights["encoder.weight"]
+    wide[:, first:first + trained.inputs] = weights["encoder.weight"]
     net.load_state_dict(weights | {"encoder.weight": wide})
 
 
@@ -78,14 +80,15 @@ def train_rl(run, cfg, paths, device):
     estimator = networks.load_estimator(paths["estimator"], device) if "estimator" in paths else None
 
     def make_env(num_envs):
-        return stacks.make(cfg.method, num_envs, estimator, cfg.passes)
+        return stacks.make(cfg.method, num_envs, estimator, cfg.passes, privileged=cfg.privileged_critic)
 
     torch.manual_seed(cfg.seed)
-    inputs = make_env(1).single_observation_space.shape[0]
-    pi, critic = networks.policy(inputs, cfg.sizes).to(device), networks.value(inputs, cfg.sizes).to(device)
+    seen = make_env(1).single_observation_space.shape[0]
+    inputs = seen - 8 * cfg.privileged_critic
+    pi, critic = networks.policy(inputs, cfg.sizes).to(device), networks.value(seen, cfg.sizes).to(device)
     if cfg.warm_start:
         start_from(pi, networks.load_recurrent(paths["policy"], device))
-        start_from(critic, networks.load_recurrent(paths["value"], device))
+        start_from(critic, networks.load_recurrent(paths["value"], device), inputs if cfg.privileged_critic else 0)
     return pi if ppo.train(run, cfg, make_env, pi, critic) else None
 
 

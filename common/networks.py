@@ -39,8 +39,11 @@ class Recurrent(nn.Module):
                     nn.init.orthogonal_(gate, 1.0 if "weight_hh" in name else 2**0.5)
 
     def forward(self, x, hidden=None):
-        """Outputs (T, B, outputs) float32 and the next hidden state of inputs (T, B, inputs); no hidden state is zeros."""
-        z = torch.tanh(self.encoder(x))
+        """Outputs (T, B, outputs) float32 and the next hidden state of inputs (T, B, D); no hidden state is zeros.
+
+        Of the D >= inputs entries the first `inputs` are read.
+        """
+        z = torch.tanh(self.encoder(x[..., :self.inputs]))
         if self.memory:
             z, hidden = self.lstm(z, hidden)
         else:
