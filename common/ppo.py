@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch.nn import functional as F
 
 from common import artifacts, episodes
 from common.networks import autocast, forget, log_prob, log_softmax, sample
@@ -60,6 +61,8 @@ class Hyperparameters:
     resume_every: int = 50
     """updates between resume points; there all worlds start anew"""
 
+
+WIDTH = 16  # sequences side by side are a multiple of it: at 149, a prime, oneDNN's LSTM takes three times as long as at 144
 _threads = ThreadPoolExecutor(2)
 STATS = ("kl", "entropy", "value_loss", "ratio", "lr", "explained")  # of an update, in metrics.csv
 
@@ -128,9 +131,9 @@ def split(done):
 
 
 def pad(x, position, sequence, length=None):
-    """Steps (T, N, ...) as padded sequences (L, S, ...)."""
+    """Steps (T, N, ...) as padded sequences (L, S, ...); the last of them, at least one, are empty."""
     length = length or int(position.max()) + 1
-    out = x.new_zeros(length, int(sequence.max()) + 1, *x.shape[2:])
+    out = x.new_zeros(length, ((int(sequence.max()) + 1) // WIDTH + 1) * WIDTH, *x.shape[2:])
     out[position, sequence] = x
     return out
 
@@ -158,7 +161,7 @@ def sequences(batch, critic, gamma, lam):
     obs[position[last] + 1, sequence[last]] = batch["final"][last]
 
     def at_start(hidden):
-        return tuple(h[:, world] * (start == 0)[None, :, None] for h in hidden)
+        return tuple(F.pad(h[:, world] * (start == 0)[None, :, None], (0, 0, 0, obs.shape[1] - len(world))) for h in hidden)
 
     hidden_pi, hidden_v = at_start(batch["hidden_pi"]), at_start(batch["hidden_v"])
     with torch.no_grad(), autocast(obs.device):
@@ -237,9 +240,15 @@ def update(actor, critic, optimizers, seq, hp):
     Returns:
         STATS but `explained`; `ratio` is the largest |ratio - 1| at the first mini-batch.
     """
-    count = seq["mask"].shape[1]
+    count = int(seq["mask"][0].sum())
     per_epoch = max(1, round(seq["mask"].sum().item() / hp.minibatch))
-    batches = [cols for _ in range(hp.epochs) for cols in torch.randperm(count).to(seq["mask"].device).chunk(per_epoch)]
+
+    def deal():
+        """All sequences in random order to mini-batches of one width, filled up with the empty one after the last."""
+        order = F.pad(torch.randperm(count), (0, -count % (WIDTH * per_epoch)), value=count)
+        return order.to(seq["mask"].device).view(-1, per_epoch).T
+
+    batches = [cols for _ in range(hp.epochs) for cols in deal()]
     jobs = zip((actor, critic), optimizers, (policy_loss, value_loss))
     told = [job.result() for job in [_threads.submit(_descend, *job, seq, batches, hp) for job in jobs]]
     last = len(batches) // hp.epochs

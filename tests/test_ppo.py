@@ -158,7 +158,10 @@ def test_whole_sequences_begin_after_episode_ends():
     assert sequence.T.tolist() == [[0, 0, 0, 1, 1], [2] * 5, [3] * 5]
     assert world.tolist() == [0, 0, 1, 2] and start.tolist() == [0, 3, 0, 0]
     padded = ppo.pad(torch.arange(1, 16).view(3, 5).T, position, sequence)
-    assert padded.T.tolist() == [[1, 2, 3, 0, 0], [4, 5, 0, 0, 0], [6, 7, 8, 9, 10], [11, 12, 13, 14, 15]]
+    assert padded.T[:4].tolist() == [[1, 2, 3, 0, 0], [4, 5, 0, 0, 0], [6, 7, 8, 9, 10], [11, 12, 13, 14, 15]]
+    assert not padded[:, 4:].any() and padded.shape[1] == ppo.WIDTH
+    full = torch.arange(ppo.WIDTH)[None]
+    assert ppo.pad(full, 0 * full, full).shape[1] == 2 * ppo.WIDTH
 
 
 # Advantages
@@ -245,8 +248,12 @@ def test_minibatches_take_every_sequence_once_an_epoch(monkeypatch):
     monkeypatch.setattr(ppo, "policy_loss", lambda net, s, cols, hp: taken.append(cols) or real(net, s, cols, hp))
     ppo.update(actor, critic, optimizers(actor, critic), seq, replace(HP, minibatch=60, epochs=2))
     assert len(taken) == 6  # 175 steps in mini-batches of about 60
+    whole = seq["mask"].any(0)
     for epoch in (taken[:3], taken[3:]):
-        assert torch.cat(epoch).sort()[0].equal(columns(seq))
+        assert {len(cols) for cols in epoch} == {ppo.WIDTH}
+        order = torch.cat(epoch)
+        assert order[whole[order]].sort()[0].equal(whole.nonzero()[:, 0])
+        assert max(whole[cols].sum() for cols in epoch) - min(whole[cols].sum() for cols in epoch) <= 1
 
 
 def test_the_learning_rate_follows_the_kl_within_its_limits():
