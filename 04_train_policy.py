@@ -66,7 +66,7 @@ def inputs_of(cfg):
 
 
 def start_from(net, trained, first=0):
-    """Copies pi_priv's (or its value net's) weights into a net that has its inputs from `first` on, and others: zero weights."""
+    """Copies pi_priv's (or its value net's) weights into a net with its inputs from `first` on; others get zero weights."""
     if net.sizes != tuple(trained.sizes):
         raise artifacts.UserError(f"--sizes {net.sizes}: pi_priv has {tuple(trained.sizes)}; use those, or --no-warm-start")
     weights = trained.state_dict()

@@ -92,12 +92,16 @@ def forget(hidden, worlds):
 
 
 def dropout(x, p):
-    """F.dropout with 16 random bits an element: four times as fast on a CPU, where the masks cost more than the layers."""
-    if p == 0:
+    """F.dropout with a random byte an element: six times as fast on a CPU, where the masks cost more than the layers.
+
+    p is rounded to whole 256ths.
+    """
+    drop = round(256 * p)
+    if drop == 0:
         return x
-    bits = torch.empty((x.numel() + 3) // 4, dtype=torch.int64, device=x.device).random_(-2**63, None)
-    keep = bits.view(torch.int16)[:x.numel()].view(x.shape) >= round(p * 2**16) - 2**15
-    return x * keep.view(torch.uint8).to(x.dtype).mul_(1 / (1 - p))
+    draws = torch.empty((x.numel() + 7) // 8, dtype=torch.int64, device=x.device).random_(-2**63, None)
+    keep = draws.view(torch.int8)[:x.numel()].view(x.shape).clamp_(drop - 129, drop - 128).sub_(drop - 129)  # 0 or 1
+    return x * keep * (256 / (256 - drop))
 
 
 class EvenLSTM(nn.LSTM):
