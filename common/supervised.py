@@ -12,7 +12,8 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
 
     Args:
         run: artifacts.Run; metrics get a row an epoch.
-        loss: loss(data, index, seed) returns the loss, averaged over valid steps, and their number.
+        loss: loss(data, index, (seed, epoch, mini-batch, purpose)) returns the loss, averaged over the steps it looks at,
+            and the number of valid steps.
         save: called after each epoch with the lowest validation loss so far.
         data, held_out: trajectories to train and to validate on.
         sequences, epochs, lr, lr_end, grad_norm, validation: as in the stages' Config.
@@ -37,13 +38,15 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
             optimizer.param_groups[0]["lr"] = lr_end + (lr - lr_end) * (1 + math.cos(math.pi * progress)) / 2
             value, steps = loss(data, index, (seed, epoch, k, 1))  # the last number keeps apart what the seeds are for
             optimizer.zero_grad(set_to_none=True)
-            (value * (steps / usual)).backward()  # a step counts the same in every mini-batch
-            torch.nn.utils.clip_grad_norm_(net.parameters(), grad_norm)
+            share = steps / usual  # a step counts the same in every mini-batch, clipped or not
+            (value * share).backward()
+            torch.nn.utils.clip_grad_norm_(net.parameters(), grad_norm * share)
             optimizer.step()
             losses.append(value.item()), weights.append(steps)
             bar.update()
             bar.set_postfix_str(f"loss {losses[-1]:.3f}", refresh=False)
-        with torch.no_grad():  # the same noise and occlusions every epoch
+        torch.manual_seed(seed)
+        with torch.no_grad():  # the same noise, occlusions and dropout every epoch
             batches = trajectories.batches(trajectories.subset(held_out, validation), sequences)
             values, steps = zip(*(loss(held_out, index, (0, 0, k, 2)) for k, index in enumerate(batches)))
         validation_loss = float(np.average([v.item() for v in values], weights=steps))
