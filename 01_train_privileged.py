@@ -10,9 +10,7 @@ from dataclasses import dataclass
 
 import torch
 
-from common import artifacts, networks, plots, ppo
-from common.env import PushVectorEnv
-from common.symmetry import Mirrored
+from common import artifacts, networks, plots, ppo, stacks
 
 
 @dataclass
@@ -50,7 +48,8 @@ def main(cfg):
         if update in spaced:
             networks.save_recurrent(run.dir / names[spaced[update]], actor)
 
-    if not ppo.train(run, cfg, lambda n: Mirrored(PushVectorEnv(n)), pi_priv, critic, keep):
+    env, held_out = (stacks.make("priv_on_state", n) for n in (cfg.num_envs, cfg.eval_episodes))
+    if not ppo.train(run, cfg, env, held_out, pi_priv, critic, keep):
         return
     networks.save_recurrent(run.dir / "policy.safetensors", pi_priv)
     networks.save_recurrent(run.dir / "value.safetensors", critic)

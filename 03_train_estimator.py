@@ -77,10 +77,13 @@ def error_against_passes(estimator, data, cfg, device):
                 return estimator.predict(o, passes=passes)[0]
         return poses
 
-    return {m: tables.error_table(trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, predict(m))) for m in GRID}
+    sums = {m: trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, predict(m)) for m in GRID}
+    return {m: tables.error_table(sums[m]) for m in GRID}
 
 
 def main(cfg):
+    if not 0 <= cfg.dropout < 1:
+        raise artifacts.UserError(f"--dropout {cfg.dropout}: at least 0 and below 1")
     device = artifacts.device_of(cfg)
     for method in METHODS if cfg.method == "all" else [cfg.method]:
         cfg = replace(cfg, method=method)

@@ -78,18 +78,15 @@ def start_from(net, trained, first=0):
 def train_rl(run, cfg, paths, device):
     """Recurrent PPO on the method's stack (sec. 3.3). Returns the policy, None when the time limit stopped it."""
     estimator = networks.load_estimator(paths["estimator"], device) if "estimator" in paths else None
-
-    def make_env(num_envs):
-        return stacks.make(cfg.method, num_envs, estimator, cfg.passes, privileged=cfg.privileged_critic)
-
+    env = stacks.make(cfg.method, cfg.num_envs, estimator, cfg.passes, privileged=cfg.privileged_critic)
+    held_out = stacks.make(cfg.method, cfg.eval_episodes, estimator, cfg.passes)
     torch.manual_seed(cfg.seed)
-    seen = make_env(1).single_observation_space.shape[0]
-    inputs = seen - 8 * cfg.privileged_critic
-    pi, critic = networks.policy(inputs, cfg.sizes).to(device), networks.value(seen, cfg.sizes).to(device)
+    seen, known = (e.single_observation_space.shape[0] for e in (held_out, env))
+    pi, critic = networks.policy(seen, cfg.sizes).to(device), networks.value(known, cfg.sizes).to(device)
     if cfg.warm_start:
         start_from(pi, networks.load_recurrent(paths["policy"], device))
-        start_from(critic, networks.load_recurrent(paths["value"], device), inputs if cfg.privileged_critic else 0)
-    return pi if ppo.train(run, cfg, make_env, pi, critic) else None
+        start_from(critic, networks.load_recurrent(paths["value"], device), seen if cfg.privileged_critic else 0)
+    return pi if ppo.train(run, cfg, env, held_out, pi, critic) else None
 
 
 def train_bc(run, cfg, paths, device):

@@ -117,7 +117,7 @@ def main(config_class: type, presets: dict[str, dict], run: Callable, doc: str):
         if failure.errno not in (None, errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST,
                                  errno.ENOTDIR):
             raise
-        message, code = f"cannot write ({failure}): make room, or choose another --out", 2
+        message, code = f"cannot read or write ({failure}): make room, or choose another --out", 2
     print("error:", " ".join(message.split()), file=sys.stderr)
     sys.exit(code)
 

@@ -10,9 +10,9 @@ LOG_VAR = (-14.0, 4.0)  # clamp of the predicted log-variances
 
 
 def autocast(device):
-    """bfloat16 autocast where the machine computes in it, else float32."""
+    """bfloat16 autocast on a CPU that computes in it, else float32: CUDA's runs an LSTM in float16, too coarse for PPO."""
     device = torch.device(device)
-    fast = torch.cuda.is_bf16_supported() if device.type == "cuda" else torch.cpu._is_avx512_bf16_supported()
+    fast = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
     return torch.autocast(device.type, torch.bfloat16, enabled=fast)
 
 
@@ -39,11 +39,8 @@ class Recurrent(nn.Module):
                     nn.init.orthogonal_(gate, 1.0 if "weight_hh" in name else 2**0.5)
 
     def forward(self, x, hidden=None):
-        """Outputs (T, B, outputs) float32 and the next hidden state of inputs (T, B, D); no hidden state is zeros.
-
-        Of the D >= inputs entries the first `inputs` are read.
-        """
-        z = torch.tanh(self.encoder(x[..., :self.inputs]))
+        """Outputs (T, B, outputs) float32 and the next hidden state of inputs (T, B, inputs); no hidden state is zeros."""
+        z = torch.tanh(self.encoder(x))
         if self.memory:
             z, hidden = self.lstm(z, hidden)
         else:
@@ -94,9 +91,9 @@ def forget(hidden, worlds):
 def dropout(x, p):
     """F.dropout with a random byte an element: six times as fast on a CPU, where the masks cost more than the layers.
 
-    p is rounded to whole 256ths.
+    p in [0, 1) is rounded to whole 256ths.
     """
-    drop = round(256 * p)
+    drop = min(round(256 * p), 255)
     if drop == 0:
         return x
     draws = torch.empty((x.numel() + 7) // 8, dtype=torch.int64, device=x.device).random_(-2**63, None)
@@ -202,5 +199,6 @@ def _load(kind, path, device):
         net = kind(**meta)
         net.load_state_dict({name: x.float() for name, x in tensors.items()})
     except (TypeError, RuntimeError):
-        raise artifacts.UserError(f"{path} holds another net than expected: rerun its stage with --force") from None
+        raise artifacts.UserError(f"{path} holds another net than expected: rerun its stage with --force, "
+                                  "or take weights of this version") from None
     return net.to(device).requires_grad_(False)

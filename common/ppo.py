@@ -71,6 +71,7 @@ def rollout(env, actor, critic, carry, steps):
     """Plays `steps` steps with sampled actions.
 
     Args:
+        actor, critic: the critic reads the whole observation, the actor its first entries (stacks.Privileged) or all.
         carry: observations (N, D) and the hidden states of actor and critic, each with its own (h, c).
     Returns:
         batch: obs (T, N, D), actions (T, N, 2), logp (T, N, 2, 11), reward, terminated, done (T, N), final (T, N, D; set
@@ -89,7 +90,7 @@ def rollout(env, actor, critic, carry, steps):
         b["obs"][t] = obs
         x = torch.as_tensor(obs, device=device)[None]
         with torch.no_grad(), autocast(device):
-            logits, hidden_pi = actor(x, hidden_pi)
+            logits, hidden_pi = actor(x[..., :actor.inputs], hidden_pi)
             _, hidden_v = critic(x, hidden_v)
         action = sample(logits[0])
         actions.append(action)
@@ -195,7 +196,7 @@ def policy_loss(actor, seq, cols, hp):
     """Clipped surrogate with entropy bonus over valid steps; and entropy, KL from the old policy, max |ratio - 1|."""
     mask, obs, actions, old, advantage = _columns(seq, cols, "obs", "actions", "logp", "advantage")
     with autocast(obs.device):
-        logits = actor(obs, tuple(h[:, cols] for h in seq["hidden_pi"]))[0]
+        logits = actor(obs[..., :actor.inputs], tuple(h[:, cols] for h in seq["hidden_pi"]))[0]
     logp = log_softmax(logits)
     ratio = (log_prob(logp, actions) - log_prob(old, actions)).exp()
     surrogate = _mean(torch.minimum(ratio * advantage, ratio.clamp(1 - hp.clip, 1 + hp.clip) * advantage), mask)
@@ -241,7 +242,7 @@ def update(actor, critic, optimizers, seq, hp):
         STATS but `explained`; `ratio` is the largest |ratio - 1| at the first mini-batch.
     """
     count = int(seq["mask"][0].sum())
-    per_epoch = max(1, round(seq["mask"].sum().item() / hp.minibatch))
+    per_epoch = min(count, max(1, round(seq["mask"].sum().item() / hp.minibatch)))
 
     def deal():
         """All sequences in random order to mini-batches of one width, filled up with the empty one after the last."""
@@ -273,19 +274,19 @@ def one_thread():
 
 
 @one_thread()
-def train(run, hp, make_env, actor, critic, keep=None):
+def train(run, hp, env, held_out, actor, critic, keep=None):
     """PPO from the last resume point to `hp.updates`; every `hp.eval_every` updates a row of metrics.
 
     Args:
         run: artifacts.Run, for metrics, resume points and the time limit.
         hp: Hyperparameters, with the stage's seed.
-        make_env: make_env(num_envs) returns a stack of wrappers over a PushVectorEnv.
+        env, held_out: stacks of wrappers over a PushVectorEnv to train and to measure in, of hp.num_envs and hp.eval_episodes
+            worlds.
         keep: keep(update, actor), called before each update and after the last, for checkpoints.
     Returns:
         True when trained to the end, False when the time limit stopped it.
     """
     device = next(actor.parameters()).device
-    env, held_out = make_env(hp.num_envs), make_env(hp.eval_episodes)
     aids = env.unwrapped
     aids.tolerance = hp.tolerance
     optimizers = [torch.optim.Adam(net.parameters(), lr=hp.lr, eps=1e-5) for net in (actor, critic)]

@@ -100,20 +100,25 @@ def percent(rate):
     return f"{rate['mean']:.1%} [{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]"
 
 
+def within(mean, half):
+    return f"{mean:.2f} [{mean - half:.2f}, {mean + half:.2f}]"
+
+
 def beside_paper(results):
     """Every number of sec. 5 beside the paper's, with 95 % intervals."""
     rows = []
     for kind, e in results["estimator_ablation"].items():
         for key, unit, paper in zip(ERRORS, ("mean L2, mm", "RMSE, mm", "mean abs., deg", "RMSE, deg"), PAPER_ERRORS[kind]):
-            rows.append([f"error of {kind}: {unit}", f"{e[key]:.2f} +- {e['half_95'][key]:.2f}", f"{paper:.2f}"])
+            rows.append([f"error of {kind}: {unit}", within(e[key], e["half_95"][key]), f"{paper:.2f}"])
     rows += [[f"success of {method}", percent(results["success_rate"][method]), f"{paper}%"]
              for method, paper in PAPER_SUCCESS.items()]
     for method, paper in PAPER_LOSS.items():
         d = results["occlusion_loss"][method]
         rows.append([f"loss of {method} from no to full occlusion, points",
                      f"{100 * d['mean']:.1f} [{100 * d['low']:.1f}, {100 * d['high']:.1f}]", f"{paper}"])
-    rows += [[f"contact switches of {method}, mean +- std", f"{s['mean']:.2f} +- {s['std']:.2f}", PAPER_SWITCHES[method]]
-             for method, s in results["contact_switches"].items()]
+    for method, s in results["contact_switches"].items():
+        mean = within(s["mean"], Z * s["std"] / math.sqrt(s["episodes"]))
+        rows.append([f"contact switches of {method}, mean +- std", f"{mean} +- {s['std']:.2f}", PAPER_SWITCHES[method]])
     return "Beside the paper, with 95 % intervals\n\n" + aligned(["number", "here", "paper"], rows)
 
 

@@ -153,7 +153,7 @@ def test_tables_line_up_and_hold_every_method():
     assert all(f"| {m} " in tables.success_rate(results) for m in plots.METHODS)
     assert "10.0%, 10.0%" in tables.estimator_ablation(results) and "(2)" in tables.success_rate(results)
     beside = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tables.beside_paper(results).splitlines()[4:]]
-    assert len(beside) == 16 + 6 + 4 + 2 and ["error of ours: mean L2, mm", "4.00 +- 4.00", "4.42"] in beside
+    assert len(beside) == 16 + 6 + 4 + 2 and ["error of ours: mean L2, mm", "4.00 [0.00, 8.00]", "4.42"] in beside
     paper = {name: number for name, _, number in beside}
     assert paper["success of est_uncertainty"] == "94%" and paper["error of ours: mean abs., deg"] == "2.10"
     assert [number for name, number in paper.items() if "contact switches" in name] == ["2.68 +- 1.53", "4.22 +- 2.67"]

@@ -256,6 +256,13 @@ def test_minibatches_take_every_sequence_once_an_epoch(monkeypatch):
         assert max(whole[cols].sum() for cols in epoch) - min(whole[cols].sum() for cols in epoch) <= 1
 
 
+def test_no_minibatch_is_empty_where_there_are_fewer_sequences():
+    actor, critic = nets()
+    batch = second_rollout(actor, critic, num=2)
+    stats = ppo.update(actor, critic, optimizers(actor, critic), ppo.sequences(batch, critic, 0.99, 0.95), replace(HP, minibatch=1))
+    assert np.isfinite(list(stats.values())).all()
+
+
 def test_the_learning_rate_follows_the_kl_within_its_limits():
     actor, critic = nets()
     seq = ppo.sequences(second_rollout(actor, critic), critic, 0.99, 0.95)
