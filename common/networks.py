@@ -1,4 +1,6 @@
 """The recurrent policy and value nets (appendix B.1), and the state estimator with its uncertainty (sec. 3.2)."""
+from concurrent.futures import ThreadPoolExecutor
+
 import torch
 from torch import nn
 from torch.nn import functional as F
@@ -7,6 +9,7 @@ from common import artifacts
 from common.task import BINS
 
 LOG_VAR = (-14.0, 4.0)  # clamp of the predicted log-variances
+_threads = ThreadPoolExecutor(2)  # for the passes of a step, where torch itself has one
 
 
 def autocast(device):
@@ -88,7 +91,7 @@ def forget(hidden, worlds):
     return tuple(h * (~worlds)[None, :, None] for h in hidden)
 
 
-def dropout(x, p):
+def dropout(x, p, generator=None):
     """F.dropout with a random byte an element: six times as fast on a CPU, where the masks cost more than the layers.
 
     p in [0, 1) is rounded to whole 256ths.
@@ -96,7 +99,7 @@ def dropout(x, p):
     drop = min(round(256 * p), 255)
     if drop == 0:
         return x
-    draws = torch.empty((x.numel() + 7) // 8, dtype=torch.int64, device=x.device).random_(-2**63, None)
+    draws = torch.empty((x.numel() + 7) // 8, dtype=torch.int64, device=x.device).random_(-2**63, None, generator=generator)
     keep = draws.view(torch.int8)[:x.numel()].view(x.shape).clamp_(drop - 129, drop - 128).sub_(drop - 129)  # 0 or 1
     return x * keep * (256 / (256 - drop))
 
@@ -129,10 +132,10 @@ class Estimator(nn.Module):
         self.layers = nn.ModuleList([nn.Linear(sizes[0], sizes[1]), nn.Linear(sizes[1], sizes[2]),
                                      nn.Linear(sizes[2], 8 if likelihood else 4)])
 
-    def head(self, z):
+    def head(self, z, generator=None):
         """Poses (..., 4) and log-variances (..., 4) or None of features (..., H), with a fresh dropout mask each call."""
         for i, layer in enumerate(self.layers):
-            z = layer(dropout(z, self.dropout))  # at training and testing time
+            z = layer(dropout(z, self.dropout, generator))  # at training and testing time
             if i < 2:
                 z = torch.tanh(z)
         q, log_var = z.float().split(4, -1) if self.likelihood else (z.float(), None)
@@ -147,9 +150,15 @@ class Estimator(nn.Module):
         """Predictive mean and total variance (T, B, 4) (eqs. 3, 4), and hidden state: LSTM once, head `passes` times."""
         z, hidden = self.lstm(o, hidden)
         passes = passes if self.dropout else 1
-        at_once = max(1, 2**15 // (z.shape[0] * z.shape[1]))  # bounds the memory; a single world runs all passes at once
-        heads = [self.head(z.expand(min(at_once, passes - i), *z.shape)) for i in range(0, passes, at_once)]
-        q, log_var = zip(*heads)
+        at_once = min(max(1, 2**15 // (z.shape[0] * z.shape[1])), (passes + 1) // 2)  # the first bounds the memory
+        counts = [min(at_once, passes - i) for i in range(0, passes, at_once)]
+        seeds = torch.randint(2**62, (len(counts),)).tolist()
+
+        def several(count, seed):
+            with torch.autocast(z.device.type, torch.bfloat16, enabled=z.dtype == torch.bfloat16):
+                return self.head(z.expand(count, *z.shape), torch.Generator(z.device).manual_seed(seed))
+
+        q, log_var = zip(*(_threads.map if torch.get_num_threads() == 1 else map)(several, counts, seeds))
         return *predictive(torch.cat(q), torch.cat(log_var) if self.likelihood else None), hidden
 
 

@@ -86,17 +86,22 @@ def rollout(env, actor, critic, carry, steps):
          "done": np.empty((steps, n), bool)}
     actions, logps, successes = [], [], 0
     start = {"hidden_pi": hidden_pi, "hidden_v": hidden_v}
+
+    def see(net, x, hidden):
+        with torch.no_grad(), autocast(device):
+            return net(x, hidden)
+
     for t in range(steps):
         b["obs"][t] = obs
         x = torch.as_tensor(obs, device=device)[None]
-        with torch.no_grad(), autocast(device):
-            logits, hidden_pi = actor(x[..., :actor.inputs], hidden_pi)
-            _, hidden_v = critic(x, hidden_v)
+        remembering = _threads.submit(see, critic, x, hidden_v)  # while the policy acts and the worlds move
+        logits, hidden_pi = see(actor, x[..., :actor.inputs], hidden_pi)
         action = sample(logits[0])
         actions.append(action)
         logps.append(log_softmax(logits[0]))
         obs, b["reward"][t], b["terminated"][t], truncated, infos = env.step(action.cpu().numpy())
         b["done"][t] = b["terminated"][t] | truncated
+        hidden_v = remembering.result()[1]
         if "final_obs" in infos:
             b["final"][t] = infos["final_obs"]
             ended = torch.as_tensor(b["done"][t], device=device)
