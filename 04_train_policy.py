@@ -39,14 +39,14 @@ class Config(ppo.Hyperparameters, artifacts.Stage):
     """behaviour cloning: most trajectories of a validation (appendix B.3)"""
 
 
-_QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy=0.0005, kl_target=0.015, lr=3e-4,
-              lr_min=1e-4, lr_max=2e-3, warm_start=True, privileged_critic=True, bc_lr=2e-3, bc_lr_end=5e-5)
+_QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy=0.0005, kl_target=0.015,
+              kl_target_end=0.003, lr=3e-4, lr_min=2e-5, lr_max=2e-3, warm_start=True, privileged_critic=True, bc_lr=2e-3, bc_lr_end=5e-5)
 PRESETS = {
     "smoke": dict(num_envs=32, rollout_steps=16, updates=4, minibatch=256, epochs=2, sizes=(16, 16, 16), eval_every=2,
                   eval_episodes=16, resume_every=2, warm_start=True, privileged_critic=True, passes=2, bc_sequences=16,
                   bc_epochs=2, bc_validation=12),
     "quick": _QUICK | dict(updates=80, sizes=(64, 128, 64), passes=5, bc_sequences=25, bc_epochs=2, bc_validation=500),
-    "laptop": _QUICK | dict(updates=1000, passes=10, bc_sequences=32, bc_epochs=6, bc_validation=1000),
+    "laptop": _QUICK | dict(updates=500, passes=10, bc_sequences=32, bc_epochs=6, bc_validation=1000),
     "paper": {},
 }
 

@@ -5,7 +5,7 @@ PPO sees only a vector env: every policy of the study is another stack of wrappe
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -39,6 +39,8 @@ class Hyperparameters:
     """value loss coefficient (tab. hyperparameters)"""
     kl_target: float = 7e-3
     """target of the KL-adaptive learning rate (appendix B.1)"""
+    kl_target_end: float = 7e-3
+    """the target at the end, linearly approached; the paper's stays constant"""
     lr_min: float = 1.5e-4
     """least learning rate (appendix B.1)"""
     lr_max: float = 1e-2
@@ -332,7 +334,8 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
             carry = obs, actor.initial(hp.num_envs, device), critic.initial(hp.num_envs, device)
         batch, carry = rollout(env, actor, critic, carry, hp.rollout_steps)
         seq = sequences(batch, critic, hp.gamma, hp.lam)
-        stats = update(actor, critic, optimizers, seq, hp) | {"explained": seq["explained"]}
+        kl_target = hp.kl_target + (hp.kl_target_end - hp.kl_target) * k / hp.updates
+        stats = update(actor, critic, optimizers, seq, replace(hp, kl_target=kl_target)) | {"explained": seq["explained"]}
         ended, successes = ended + batch["success"][0], successes + batch["success"][1]
         if ended >= 512:
             if successes > 0.6 * ended:
