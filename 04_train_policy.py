@@ -40,7 +40,8 @@ class Config(ppo.Hyperparameters, artifacts.Stage):
 
 
 _QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy=0.0005, kl_target=0.015,
-              kl_target_end=0.003, lr=3e-4, lr_min=2e-5, lr_max=2e-3, warm_start=True, privileged_critic=True, bc_lr=2e-3, bc_lr_end=5e-5)
+              kl_target_end=0.003, lr=3e-4, lr_min=2e-5, lr_max=2e-3, warm_start=True, privileged_critic=True,
+              bc_lr=2e-3, bc_lr_end=5e-5)
 PRESETS = {
     "smoke": dict(num_envs=32, rollout_steps=16, updates=4, minibatch=256, epochs=2, sizes=(16, 16, 16), eval_every=2,
                   eval_episodes=16, resume_every=2, warm_start=True, privileged_critic=True, passes=2, bc_sequences=16,
