@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from common.networks import autocast
+from common.observation import show
 
 
 @torch.no_grad()
@@ -41,8 +42,7 @@ class Believed(gym.vector.VectorWrapper):
     def __init__(self, env, estimator, passes, sigma):
         super().__init__(env)
         self.estimator, self.passes, self.size = estimator, passes, 12 if sigma else 8
-        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (self.size,), np.float32)
-        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, env.num_envs)
+        show(self, self.size)
         self.hidden = None
 
     def reset(self, *, seed=None, options=None):

@@ -9,7 +9,7 @@ from common import artifacts
 from common.task import BINS
 
 LOG_VAR = (-14.0, 4.0)  # clamp of the predicted log-variances
-_threads = ThreadPoolExecutor(2)  # for the passes of a step, where torch itself has one
+threads = ThreadPoolExecutor(2)  # for whole nets or passes side by side, where torch itself has one; no job waits for another
 
 
 def autocast(device):
@@ -158,7 +158,7 @@ class Estimator(nn.Module):
             with torch.autocast(z.device.type, torch.bfloat16, enabled=z.dtype == torch.bfloat16):
                 return self.head(z.expand(count, *z.shape), torch.Generator(z.device).manual_seed(seed))
 
-        q, log_var = zip(*(_threads.map if torch.get_num_threads() == 1 else map)(several, counts, seeds))
+        q, log_var = zip(*(threads.map if torch.get_num_threads() == 1 else map)(several, counts, seeds))
         return *predictive(torch.cat(q), torch.cat(log_var) if self.likelihood else None), hidden
 
 

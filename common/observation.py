@@ -76,6 +76,12 @@ def assemble(noisy, occluded):
     return np.concatenate([task.scale(noisy), occluded[:, None].astype(np.float32)], 1)
 
 
+def show(wrapper, size):
+    """Declares a vector wrapper's observations: (N, size) float32, unbounded."""
+    wrapper.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+    wrapper.observation_space = gym.vector.utils.batch_space(wrapper.single_observation_space, wrapper.num_envs)
+
+
 class Observed(gym.vector.VectorWrapper):
     """A PushVectorEnv seen through an ObservationModel: observations (N, 9), final_obs included.
 
@@ -85,8 +91,7 @@ class Observed(gym.vector.VectorWrapper):
     def __init__(self, env, occlusion=None):
         super().__init__(env)
         self.model = ObservationModel(env.num_envs, occlusion=occlusion)
-        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (9,), np.float32)
-        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, env.num_envs)
+        show(self, 9)
 
     def reset(self, *, seed=None, options=None):
         _, infos = self.env.reset(seed=seed, options=options)

@@ -3,7 +3,6 @@
 PPO sees only a vector env: every policy of the study is another stack of wrappers.
 """
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -12,7 +11,7 @@ import torch
 from torch.nn import functional as F
 
 from common import artifacts, episodes
-from common.networks import autocast, forget, log_prob, log_softmax, sample
+from common.networks import autocast, forget, log_prob, log_softmax, sample, threads
 
 
 @dataclass
@@ -65,7 +64,6 @@ class Hyperparameters:
 
 
 WIDTH = 16  # sequences side by side are a multiple of it: at 149, a prime, oneDNN's LSTM takes three times as long as at 144
-_threads = ThreadPoolExecutor(2)
 STATS = ("kl", "entropy", "value_loss", "ratio", "lr", "explained")  # of an update, in metrics.csv
 
 
@@ -96,7 +94,7 @@ def rollout(env, actor, critic, carry, steps):
     for t in range(steps):
         b["obs"][t] = obs
         x = torch.as_tensor(obs, device=device)[None]
-        remembering = _threads.submit(see, critic, x, hidden_v)  # while the policy acts and the worlds move
+        remembering = threads.submit(see, critic, x, hidden_v)  # while the policy acts and the worlds move
         logits, hidden_pi = see(actor, x[..., :actor.inputs], hidden_pi)
         action = sample(logits[0])
         actions.append(action)
@@ -258,7 +256,7 @@ def update(actor, critic, optimizers, seq, hp):
 
     batches = [cols for _ in range(hp.epochs) for cols in deal()]
     jobs = zip((actor, critic), optimizers, (policy_loss, value_loss))
-    told = [job.result() for job in [_threads.submit(_descend, *job, seq, batches, hp) for job in jobs]]
+    told = [job.result() for job in [threads.submit(_descend, *job, seq, batches, hp) for job in jobs]]
     last = len(batches) // hp.epochs
     entropy, kl, _ = told[0][-last:].mean(0).tolist()
     lr = optimizers[0].param_groups[0]["lr"]

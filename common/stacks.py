@@ -5,7 +5,7 @@ import numpy as np
 from common import task
 from common.belief import Believed
 from common.env import PushVectorEnv
-from common.observation import Observed
+from common.observation import Observed, show
 from common.symmetry import Mirrored, mirror
 
 # method -> the estimator in its loop
@@ -43,9 +43,7 @@ class Privileged(gym.vector.VectorWrapper):
     def __init__(self, env, frame):
         super().__init__(env)
         self.frame = frame
-        size = env.single_observation_space.shape[0] + 8
-        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, env.num_envs)
+        show(self, env.single_observation_space.shape[0] + 8)
 
     def reset(self, *, seed=None, options=None):
         obs, infos = self.env.reset(seed=seed, options=options)

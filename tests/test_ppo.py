@@ -259,7 +259,8 @@ def test_minibatches_take_every_sequence_once_an_epoch(monkeypatch):
 def test_no_minibatch_is_empty_where_there_are_fewer_sequences():
     actor, critic = nets()
     batch = second_rollout(actor, critic, num=2)
-    stats = ppo.update(actor, critic, optimizers(actor, critic), ppo.sequences(batch, critic, 0.99, 0.95), replace(HP, minibatch=1))
+    seq = ppo.sequences(batch, critic, 0.99, 0.95)
+    stats = ppo.update(actor, critic, optimizers(actor, critic), seq, replace(HP, minibatch=1))
     assert np.isfinite(list(stats.values())).all()
 
 

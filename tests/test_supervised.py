@@ -6,8 +6,6 @@ import torch
 
 from common import supervised
 
-RUN = SimpleNamespace(load_resume=lambda: None, save_resume=lambda state: None, log=lambda **row: None, out_of_time=lambda: False)
-
 
 @pytest.mark.parametrize("slope", [1.0, 1e3])  # the gradient's norm is that, or clipped to 1
 def test_a_step_counts_the_same_in_every_minibatch(slope, monkeypatch, tmp_path):
@@ -21,8 +19,9 @@ def test_a_step_counts_the_same_in_every_minibatch(slope, monkeypatch, tmp_path)
         steps.append(int(np.diff(data[1])[index].sum()))
         return slope * net.weight.sum(), steps[-1]
 
-    RUN.dir = tmp_path
-    assert supervised.fit(RUN, net, loss, lambda: None, data, data, seed=0, sequences=8, epochs=1, lr=1e-3, lr_end=1e-3,
+    run = SimpleNamespace(dir=tmp_path, load_resume=lambda: None, save_resume=lambda state: None, log=lambda **row: None,
+                          out_of_time=lambda: False)
+    assert supervised.fit(run, net, loss, lambda: None, data, data, seed=0, sequences=8, epochs=1, lr=1e-3, lr_end=1e-3,
                           grad_norm=1.0, validation=64)
     gradients, counts = np.array(told).T
     assert len(told) == 8 and counts.max() > 2 * counts.min()
