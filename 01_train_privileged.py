@@ -54,7 +54,7 @@ def main(cfg):
         return
     networks.save_recurrent(run.dir / "policy.safetensors", pi_priv)
     networks.save_recurrent(run.dir / "value.safetensors", critic)
-    plots.success_rate_priv(run.dir.parent, run.dir / "success_rate_priv.png")
+    plots.success_rate_priv(cfg.own, run.dir / "success_rate_priv.png")
     run.finish(["policy.safetensors", "value.safetensors", *names], **ppo.outcome(run))
     print(f"{run.dir}: pi_priv succeeds in {run.record['success']:.1%} of held-out episodes")
 

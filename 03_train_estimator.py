@@ -103,7 +103,7 @@ def main(cfg):
             plots.passes(errors, run.dir / "passes.png")
             outputs.append("passes.json")
         name = "mse_loss" if method == "mse" else "likelihood_loss"
-        plots.validation_loss(run.dir.parent.parent, name, run.dir / f"{name}.png")
+        plots.validation_loss(cfg.own, name, run.dir / f"{name}.png")
         run.finish(outputs, **supervised.outcome(run))
         print(f"{run.dir}: validation loss {run.record['validation_loss']:.4f}")
 

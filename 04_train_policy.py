@@ -131,11 +131,11 @@ def main(cfg):
             return
         networks.save_recurrent(run.dir / "policy.safetensors", pi)
         if method == "behavior_cloning":
-            plots.validation_loss(run.dir.parent.parent, "bc_loss", run.dir / "bc_loss.png")
+            plots.validation_loss(cfg.own, "bc_loss", run.dir / "bc_loss.png")
             run.finish(["policy.safetensors"], **supervised.outcome(run))
             print(f"{run.dir}: validation loss {run.record['validation_loss']:.4f}")
         else:
-            plots.success_rate(run.dir.parent.parent, run.dir / "success_rate.png")
+            plots.success_rate(cfg.own, run.dir / "success_rate.png")
             run.finish(["policy.safetensors"], **ppo.outcome(run))
             print(f"{run.dir}: succeeds in {run.record['success']:.1%} of held-out episodes")
 

@@ -2,10 +2,11 @@
 
     python 05_evaluate.py [pretrained|smoke|quick|laptop|paper] [--weights DIR] [--episodes n] [--seed k] [--field value ...]
 
-Reads pi_priv (01), the test set (02), the estimators (03), every finished seed of the policies (04) and their metrics.csv:
-of the same preset, or in the folder --weights, which is pretrained/ with the preset pretrained. Writes
-runs/<preset>/05_evaluate/seed<k>/: results.json, tables.md, success_rate.png, occlusion_duration.png,
-trajectory_with_uncertainty.png, sim.png and film.mp4, film.gif. Resumes after the last finished measurement.
+Reads pi_priv (01), the test set (02), the estimators (03), every finished seed of the policies (04) and the metrics.csv of
+all: of the same preset, or in the folder --weights, which is pretrained/ with the preset pretrained. Writes
+runs/<preset>/05_evaluate/seed<k>/: results.json, tables.md, film.mp4, film.gif, and as PNG the figures of sec. 5 and of the
+appendix: success_rate, occlusion_duration, trajectory_with_uncertainty, sim, success_rate_priv, likelihood_loss, mse_loss,
+bc_loss. Resumes after the last finished measurement.
 """
 import json
 import math
@@ -153,7 +154,10 @@ def report(run):
 def draw(run, players, results, done):
     """Every figure, and the film; returns which episodes they show."""
     levels = {m: results["success_rate"][m]["mean"] for m in ("priv_on_estimate", "behavior_cloning")}
-    plots.success_rate(run.cfg.source / "04_train_policy", run.dir / "success_rate.png", levels)
+    plots.success_rate(run.cfg.source, run.dir / "success_rate.png", levels)
+    plots.success_rate_priv(run.cfg.source, run.dir / "success_rate_priv.png")
+    for name in plots.LOSSES:
+        plots.validation_loss(run.cfg.source, name, run.dir / f"{name}.png")
     plots.occlusion_duration(results["occlusion_duration"], run.dir / "occlusion_duration.png")
     plots.sim(run.dir / "sim.png")
 

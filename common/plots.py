@@ -1,4 +1,7 @@
-"""Every figure, named as in the paper, from what the runs wrote. A seed or method that is not there is left out."""
+"""Every figure, named as in the paper, from what the runs wrote. A seed or method that is not there is left out.
+
+`study` is the folder of a preset's runs, as <out>/<preset>.
+"""
 import csv
 
 import cv2
@@ -29,6 +32,10 @@ METHODS = {
 }
 ESTIMATORS = {"ours": ("ours (likelihood + MC dropout)", "#0072B2"), "likelihood": ("likelihood loss", "#56B4E9"),
               "mse": ("MSE loss", "#E69F00")}
+LOSSES = {  # figure: stage, {method: (label, colour)}, what is on the y axis
+    "likelihood_loss": ("03_train_estimator", {m: ESTIMATORS[m] for m in ("ours", "likelihood")}, "loss (eq. 1)"),
+    "mse_loss": ("03_train_estimator", {"mse": ESTIMATORS["mse"]}, "mean squared error"),
+    "bc_loss": ("04_train_policy", {"behavior_cloning": METHODS["behavior_cloning"][:2]}, "cross-entropy")}
 
 
 def new(width, height, rows=1, columns=1, **kw):
@@ -68,14 +75,14 @@ def success_axis(ax):
     ax.set(ylabel="success rate (%)", ylim=(-2, 102))
 
 
-def success_rate_priv(stage_dir, path):
+def success_rate_priv(study, path):
     """Fig. success_rate_priv: held-out success of pi_priv over training."""
     figure, ax = new(5, 3)
     name, color, _ = METHODS["priv_on_state"]
-    band(ax, stage_dir, "steps", "success", name, color, 1e-6, 100)
+    if band(ax, study / "01_train_privileged", "steps", "success", name, color, 1e-6, 100):
+        ax.legend(loc="lower right")
     ax.set(xlabel="environment steps (millions)")
     success_axis(ax)
-    ax.legend(loc="lower right")
     save(figure, path)
 
 
@@ -107,25 +114,24 @@ def passes(errors, path):
     save(figure, path)
 
 
-def validation_loss(stage_dir, name, path):
+def validation_loss(study, name, path):
     """Figs. likelihood_loss, mse_loss and bc_loss, by `name`: validation loss over epochs."""
     figure, ax = new(5, 3)
-    shown = {"likelihood_loss": {m: ESTIMATORS[m] for m in ("ours", "likelihood")}, "mse_loss": {"mse": ESTIMATORS["mse"]},
-             "bc_loss": {"behavior_cloning": METHODS["behavior_cloning"][:2]}}[name]
-    for method, (label, color) in shown.items():
-        band(ax, stage_dir / method, "epoch", "validation_loss", label, color, marker="o", ms=3)
-    ylabel = {"likelihood_loss": "loss (eq. 1)", "mse_loss": "mean squared error", "bc_loss": "cross-entropy"}[name]
+    stage, shown, ylabel = LOSSES[name]
+    found = [band(ax, study / stage / method, "epoch", "validation_loss", label, color, marker="o", ms=3)
+             for method, (label, color) in shown.items()]
     ax.set(xlabel="epoch", ylabel=f"validation {ylabel}", yscale="log" if name == "mse_loss" else "linear")
     ax.xaxis.get_major_locator().set_params(integer=True)
-    ax.legend()
+    if any(found):
+        ax.legend()
     save(figure, path)
 
 
-def success_rate(stage_dir, path, levels={}):
+def success_rate(study, path, levels={}):
     """Fig. success_rate: held-out success over training; levels {method: rate} of methods without RL are dashed lines."""
     figure, ax = new(7, 3.6)
     for i, method in enumerate(METHODS):  # those with a curve: what PPO trained
-        band(ax, stage_dir / method, "steps", "success", *METHODS[method][:2], 1e-6, 100, zorder=2.9 - i / 10)
+        band(ax, study / "04_train_policy" / method, "steps", "success", *METHODS[method][:2], 1e-6, 100, zorder=2.9 - i / 10)
     for method, level in levels.items():
         name, color, _ = METHODS[method]
         ax.axhline(100 * level, color=color, ls="--", lw=1.4, label=f"{name}, after training")

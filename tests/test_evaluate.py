@@ -180,16 +180,18 @@ def shape(path):
 
 
 def test_every_figure_is_drawn_with_whatever_runs_there_are(tmp_path, short):
-    stage, play = tmp_path / "stage", players()
-    for method in ("ours", "mse", "behavior_cloning"):
-        write_metrics(stage / method / "seed0", [dict(epoch=i, train_loss=1, validation_loss=2 / i) for i in (1, 2, 3)])
-    for method, seed in (("est", 0), ("est", 1), ("end_to_end", 0)):
-        write_metrics(stage / method / f"seed{seed}", [dict(steps=i, success=i / 10) for i in range(3)])
-    for name in ("likelihood_loss", "mse_loss", "bc_loss"):
-        plots.validation_loss(stage, name, tmp_path / f"{name}.png")
-    plots.success_rate(stage, tmp_path / "success_rate.png", {"priv_on_estimate": 0.8})
-    plots.success_rate(tmp_path / "empty", tmp_path / "empty.png")
-    plots.success_rate_priv(stage / "est", tmp_path / "success_rate_priv.png")
+    study, play = tmp_path / "study", players()
+    for run in ("03_train_estimator/ours", "03_train_estimator/mse", "04_train_policy/behavior_cloning"):
+        write_metrics(study / run / "seed0", [dict(epoch=i, train_loss=1, validation_loss=2 / i) for i in (1, 2, 3)])
+    for run in ("01_train_privileged/seed0", *(f"04_train_policy/{m}" for m in ("est/seed0", "est/seed1", "end_to_end/seed0"))):
+        write_metrics(study / run, [dict(steps=i, success=i / 10) for i in range(3)])
+    for folder in study, tmp_path / "empty":
+        for name in plots.LOSSES:
+            plots.validation_loss(folder, name, tmp_path / f"{folder.name}_{name}.png")
+        plots.success_rate(folder, tmp_path / f"{folder.name}_success_rate.png", {"priv_on_estimate": 0.8})
+        plots.success_rate_priv(folder, tmp_path / f"{folder.name}_success_rate_priv.png")
+    assert all((cv2.imread(str(path)) != cv2.imread(str(path).replace("study_", "empty_"))).any()
+               for path in tmp_path.glob("study_*.png"))
     plots.checkpoints([dict(checkpoint=i, episodes=2, success=0.5) for i in range(3)], tmp_path / "checkpoints.png")
     errors = {"trans_mean_l2_mm": 4.0, "rot_mean_abs_deg": 2.0}
     plots.passes({m: errors | {"seen": errors, "occluded": errors} for m in (1, 10)}, tmp_path / "passes.png")
@@ -200,7 +202,7 @@ def test_every_figure_is_drawn_with_whatever_runs_there_are(tmp_path, short):
             for m in ("est_uncertainty", "priv_on_estimate")}
     plots.trajectory_with_uncertainty(pair, tmp_path / "trajectory.png", 3, 6, 1)
     images = sorted(tmp_path.glob("*.png"))
-    assert len(images) == 11 and all(min(shape(path)[:2]) >= 350 for path in images)
+    assert len(images) == 15 and all(min(shape(path)[:2]) >= 350 for path in images)
     assert not list(tmp_path.rglob(".*"))  # nothing half-written
 
 

@@ -32,7 +32,8 @@ OUTPUTS = {
     "03_train_estimator/mse/seed0": ["estimator.safetensors", "mse_loss.png"],
     "04_train_policy/behavior_cloning/seed0": ["policy.safetensors", "bc_loss.png"],
     "05_evaluate/seed0": ["results.json", "tables.md", "success_rate.png", "occlusion_duration.png", "sim.png",
-                          "trajectory_with_uncertainty.png", "film.mp4", "film.gif"],
+                          "trajectory_with_uncertainty.png", "film.mp4", "film.gif", "success_rate_priv.png",
+                          "likelihood_loss.png", "mse_loss.png", "bc_loss.png"],
     "06_robot/seed0": ["summary.json", "robot.png", "natural_000.npz", "hand_5s_000.npz", "hand_full_000.npz"],
 } | {f"04_train_policy/{m}/seed0": ["policy.safetensors", "success_rate.png"] for m in POLICIES - {"behavior_cloning"}}
 
@@ -240,7 +241,7 @@ def test_a_second_run_does_nothing(study, call):
 def test_published_nets_are_evaluated_as_in_their_study(study, call, tmp_path):
     published = tmp_path / "published"
     for pattern in ("01_*/seed0/policy.safetensors", "02_*/seed0/test_*.npy", "03_*/*/seed0/estimator.safetensors",
-                    "04_*/*/seed0/policy.safetensors", "04_*/*/seed0/metrics.csv"):
+                    "04_*/*/seed0/policy.safetensors", "0[134]*/**/metrics.csv"):
         for path in (study / "smoke").glob(pattern):
             folder = published / path.parent.relative_to(study / "smoke")
             folder.mkdir(parents=True, exist_ok=True)
@@ -248,8 +249,9 @@ def test_published_nets_are_evaluated_as_in_their_study(study, call, tmp_path):
     out, name = tmp_path / "runs", "smoke/05_evaluate/seed0/results.json"
     assert call(out, "05_evaluate", "--weights", str(published))[2] == 0
     assert json.loads((out / name).read_text())["success_rate"] == json.loads((study / name).read_text())["success_rate"]
-    figures = (cv2.imread(str(root / "smoke/05_evaluate/seed0/success_rate.png")) for root in (out, study))
-    assert (next(figures) == next(figures)).all()
+    for figure in "success_rate", "success_rate_priv", "likelihood_loss", "mse_loss", "bc_loss":
+        images = [cv2.imread(str(root / f"smoke/05_evaluate/seed0/{figure}.png")) for root in (out, study)]
+        assert (images[0] == images[1]).all()
     assert call(out, "06_robot", "--scenario", "natural", "--weights", str(published))[2] == 0
     assert {path.name for path in (out / "smoke").iterdir()} == {"05_evaluate", "06_robot"}
     assert not any(str(tmp_path) in path.read_text() for path in out.rglob("config.json"))
