@@ -35,9 +35,11 @@ class Config(artifacts.Reader):
     switch_episodes: int = 20_000
     """episodes for the contact switches (sec. 5.4)"""
     passes: int = 50
-    """M, stochastic passes of the estimator (sec. 4)"""
+    """M, stochastic passes of the estimator in the loop (sec. 4)"""
     test: int = 150_000
     """most trajectories of the test set (appendix B.2)"""
+    test_passes: int = 50
+    """M on the test set"""
     num_envs: int = 2000
     """worlds at once: so many episodes of the list share a seed, so another number is another list"""
 
@@ -132,7 +134,7 @@ def estimator_errors(cfg, players, test, kind):
         if kind == "vision":
             return o[..., :4]
         with networks.autocast(o.device):
-            return players.estimator(kind).predict(o, passes=cfg.passes)[0]
+            return players.estimator(kind).predict(o, passes=cfg.test_passes)[0]
 
     torch.manual_seed(LIST + cfg.seed)
     return tables.error_table(trajectories.measure(test, cfg.test, 100, LIST + cfg.seed, players.device, predict))
