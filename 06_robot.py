@@ -51,10 +51,10 @@ class Config(hardware.Gaps, artifacts.Reader):
 
 
 PRESETS = {
-    "pretrained": dict(weights=Path(__file__).parent / "pretrained", runs=10, passes=10),
+    "pretrained": dict(weights=Path(__file__).parent / "pretrained", runs=10),
     "smoke": dict(runs=1, passes=2),
-    "quick": dict(runs=1, passes=20),
-    "laptop": dict(runs=100, passes=10),
+    "quick": dict(runs=1),
+    "laptop": dict(runs=100),
     "paper": {},
 }
 
