@@ -23,21 +23,22 @@ PRESETS = {
     "smoke": dict(num_envs=32, rollout_steps=16, updates=6, minibatch=256, epochs=2, sizes=(16, 16, 16), checkpoints=3,
                   eval_every=3, eval_episodes=16, resume_every=2, tolerance=4.0, near_share=0.5),
     "quick": dict(num_envs=1024, rollout_steps=32, updates=500, minibatch=4096, epochs=3, sizes=(64, 128, 64),
-                  checkpoints=26, entropy=0.002, kl_target=0.015, kl_target_end=0.015, lr_min=1e-4, lr_max=2e-3,
-                  tolerance=4.0, near_share=0.8),
+                  checkpoints=26, entropy=0.002, kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0,
+                  near_share=0.8),
     "laptop": dict(num_envs=1024, rollout_steps=32, updates=1000, minibatch=4096, epochs=3, checkpoints=100, entropy=0.002,
-                   kl_target=0.015, kl_target_end=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.8),
+                   kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.8),
     "paper": {},
 }
 
 
 def main(cfg):
-    if not 2 <= cfg.checkpoints <= cfg.updates + 1:
-        raise artifacts.UserError(f"--checkpoints {cfg.checkpoints}: say 2 to {cfg.updates + 1}, one more than --updates")
+    most = min(1000, cfg.updates + 1)
+    if not 2 <= cfg.checkpoints <= most:
+        raise artifacts.UserError(f"--checkpoints {cfg.checkpoints}: say 2 to {most}; at most --updates and one more, or 1000")
+    device = artifacts.device_of(cfg)
     run = artifacts.Run(cfg, "01_train_privileged")
     if run.skip():
         return
-    device = artifacts.device_of(cfg)
     torch.manual_seed(cfg.seed)
     pi_priv = networks.policy(8, cfg.sizes).to(device)
     critic = networks.value(8, cfg.sizes).to(device)

@@ -135,10 +135,10 @@ def main(cfg):
     folder = artifacts.find(cfg, "01_train_privileged", "policy.safetensors").parent
     names = [name for name in artifacts.record_of(cfg, folder)["outputs"] if name.startswith("checkpoint_")]
     paths = [artifacts.find(cfg, "01_train_privileged", name) for name in sorted(names)]
+    device = artifacts.device_of(cfg)
     run = artifacts.Run(cfg, "02_collect", {p.name: p for p in paths})
     if run.skip():
         return remove_parts(run)
-    device = artifacts.device_of(cfg)
     todo = list(jobs(cfg, len(paths)))
     parts = [run.dir / f"part_{k:05d}.npz" for k in range(len(todo))]
     left = [k for k, part in enumerate(parts) if not part.exists()]

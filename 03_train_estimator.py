@@ -32,8 +32,8 @@ class Config(artifacts.Stage):
     """passes over the training set, each with fresh noise and occlusions (tab. estimator_hyperparameters)"""
     lr: float = 1e-3
     """Adam's learning rate (tab. estimator_hyperparameters)"""
-    lr_end: float = 1e-3
-    """learning rate at the end of a cosine; the paper's stays constant"""
+    lr_end: float | None = None
+    """learning rate at the end of a cosine; none: it stays, as the paper's"""
     grad_norm: float = 1.0
     """clip of the gradient norm; the paper names none"""
     validation: int = 150_000

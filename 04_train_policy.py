@@ -33,8 +33,8 @@ class Config(ppo.Hyperparameters, artifacts.Stage):
     """behaviour cloning: passes over the teacher set (tab. estimator_hyperparameters)"""
     bc_lr: float = 1e-3
     """behaviour cloning: Adam's learning rate (tab. estimator_hyperparameters)"""
-    bc_lr_end: float = 1e-3
-    """behaviour cloning: learning rate at the end of a cosine; the paper's stays constant"""
+    bc_lr_end: float | None = None
+    """behaviour cloning: learning rate at the end of a cosine; none: it stays, as the paper's"""
     bc_validation: int = 150_000
     """behaviour cloning: most trajectories of a validation (appendix B.3)"""
 
@@ -53,7 +53,7 @@ PRESETS = {
 
 
 def inputs_of(cfg):
-    """Paths of what a method reads."""
+    """Paths of what a method reads; UserError where it does not fit."""
     def nets(*names):
         return {name: artifacts.find(cfg, "01_train_privileged", f"{name}.safetensors") for name in names}
 
@@ -61,6 +61,8 @@ def inputs_of(cfg):
         train, validation = (trajectories.load_set(cfg, f"teacher_{name}")[1] for name in ("train", "validation"))
         return nets("policy") | train | validation
     paths = nets("policy", "value") if cfg.warm_start else {}
+    if cfg.warm_start and (sizes := tuple(networks.load_recurrent(paths["policy"]).sizes)) != cfg.sizes:
+        raise artifacts.UserError(f"--sizes {cfg.sizes}: pi_priv has {sizes}; use those, or --no-warm-start")
     if kind := stacks.ESTIMATOR[cfg.method]:
         paths["estimator"] = artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", kind)
     return paths
@@ -68,8 +70,6 @@ def inputs_of(cfg):
 
 def start_from(net, trained, first=0):
     """Copies pi_priv's (or its value net's) weights into a net with its inputs from `first` on; others get zero weights."""
-    if net.sizes != tuple(trained.sizes):
-        raise artifacts.UserError(f"--sizes {net.sizes}: pi_priv has {tuple(trained.sizes)}; use those, or --no-warm-start")
     weights = trained.state_dict()
     wide = torch.zeros_like(net.encoder.weight)
     wide[:, first:first + trained.inputs] = weights["encoder.weight"]

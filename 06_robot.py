@@ -217,6 +217,10 @@ def main(cfg):
     paths = {"estimator": artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", "ours"),
              "policy": artifacts.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty")}
     f, pi = networks.load_estimator(paths["estimator"]), networks.load_recurrent(paths["policy"])
+    folder = artifacts.run_folder(cfg.own, "06_robot", None, cfg.seed)
+    others = [scenario for scenario in SCENARIOS if cfg.scenario not in ("all", scenario)]
+    if cfg.force and any(runlog.read(folder, scenario) for scenario in others):
+        raise artifacts.UserError(f"--force redoes all scenarios of {folder}: say --scenario all, or another --seed")
     arm = connect(cfg)
     run = artifacts.Run(cfg, "06_robot", paths)
     logs = {scenario: runlog.read(run.dir, scenario) for scenario in SCENARIOS}
@@ -236,6 +240,7 @@ def main(cfg):
     finally:
         arm.stop()
     bar.close()
+    artifacts.save_json(run.dir / "summary.json", tables.robot_runs(logs))
     print(f"\n{tables.robot(tables.robot_runs(logs))}\n\nfigure, logs and summary.json: {run.dir}")
     run.finish(["summary.json"])
 

@@ -95,8 +95,10 @@ def parse(config_class: type, presets: dict[str, dict], doc: str, args: list[str
         message = box.getvalue().partition("\n")[2].partition("│ ─")[0].replace("│", " ").strip().rstrip(".")
         raise UserError(f"{message}; see {script} {preset} --help") from None
     for name, value in vars(cfg).items():
-        if type(value) is int and value < (name != "seed"):
-            raise UserError(f"--{name.replace('_', '-')} {value}: at least {int(name != 'seed')}")
+        for number in value if isinstance(value, tuple) else [value]:
+            least = int(type(number) is int and name != "seed")
+            if type(number) in (int, float) and not number >= least:
+                raise UserError(f"--{name.replace('_', '-')} {number}: at least {least}")
     return cfg
 
 

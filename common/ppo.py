@@ -2,6 +2,7 @@
 
 PPO sees only a vector env: every policy of the study is another stack of wrappers.
 """
+import math
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -38,8 +39,8 @@ class Hyperparameters:
     """value loss coefficient (tab. hyperparameters)"""
     kl_target: float = 7e-3
     """target of the KL-adaptive learning rate (appendix B.1)"""
-    kl_target_end: float = 7e-3
-    """the target at the end, linearly approached; the paper's stays constant"""
+    kl_target_end: float | None = None
+    """the target at the end, linearly approached; none: it stays, as the paper's"""
     lr_min: float = 1.5e-4
     """least learning rate (appendix B.1)"""
     lr_max: float = 1e-2
@@ -288,6 +289,8 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
         env, held_out: stacks of wrappers over a PushVectorEnv to train and to measure in, of hp.num_envs and hp.eval_episodes
             worlds.
         keep: keep(update, actor), called before each update and after the last, for checkpoints.
+    Raises:
+        artifacts.UserError: the KL or the value loss of an update is not finite.
     Returns:
         True when trained to the end, False when the time limit stopped it.
     """
@@ -332,8 +335,10 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
             carry = obs, actor.initial(hp.num_envs, device), critic.initial(hp.num_envs, device)
         batch, carry = rollout(env, actor, critic, carry, hp.rollout_steps)
         seq = sequences(batch, critic, hp.gamma, hp.lam)
-        kl_target = hp.kl_target + (hp.kl_target_end - hp.kl_target) * k / hp.updates
+        kl_target = hp.kl_target + ((hp.kl_target_end or hp.kl_target) - hp.kl_target) * k / hp.updates
         stats = update(actor, critic, optimizers, seq, replace(hp, kl_target=kl_target)) | {"explained": seq["explained"]}
+        if not math.isfinite(stats["kl"] + stats["value_loss"]):
+            raise artifacts.UserError(f"{run.dir}: training diverged in update {k + 1}: use a lower rate, and --force")
         ended, successes = ended + batch["success"][0], successes + batch["success"][1]
         if ended >= 512:
             if successes > 0.6 * ended:

@@ -16,14 +16,14 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
             and the number of valid steps.
         save: called after each epoch with the lowest validation loss so far.
         data, held_out: trajectories to train and to validate on.
-        sequences, epochs, lr, lr_end, grad_norm, validation: as in the stages' Config.
+        sequences, epochs, lr, lr_end (none: lr), grad_norm, validation: as in the stages' Config.
     Raises:
         artifacts.UserError: the validation loss is not finite.
     Returns:
         True when trained to the end, False when the time limit stopped it.
     """
     optimizer = torch.optim.Adam(net.parameters(), lr=lr)
-    count, first, best = len(data[1]) - 1, 0, math.inf
+    count, first, best, lr_end = len(data[1]) - 1, 0, math.inf, lr if lr_end is None else lr_end
     if state := run.load_resume():
         net.load_state_dict(state["net"]), optimizer.load_state_dict(state["optimizer"])
         first, best = state["epoch"], state["best"]

@@ -21,7 +21,7 @@ def wilson(values):
     n, p = len(values), float(np.mean(values))
     center, half = p + Z**2 / (2 * n), Z * math.sqrt(p * (1 - p) / n + Z**2 / (4 * n**2))
     low, high = ((center + side * half) / (1 + Z**2 / n) for side in (-1, 1))
-    return {"mean": p, "low": max(0.0, low), "high": min(1.0, high), "episodes": n}
+    return {"mean": p, "low": min(p, max(0.0, low)), "high": max(p, min(1.0, high)), "episodes": n}  # rounding: p = 0, 1
 
 
 def paired(values, reference):

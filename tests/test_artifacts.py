@@ -291,8 +291,8 @@ def test_presets():
     assert (parse("paper").preset, parse("paper").rate) == ("paper", 0.001)
     assert parse("paper", "--rate", "5", "--widths", "1", "2", "--max-minutes", "2").widths == (1, 2)
     for wrong in [["--seed", "-1"], ["--device", "tpu"], ["--rate"], ["--preset", "paper"], ["--seed", "1.5"],
-                  ["--force", "yes"]]:
-        with pytest.raises(UserError, match=wrong[-1] if wrong[0] != "--rate" else "--rate"):
+                  ["--force", "yes"], ["--rate", "-0.1"], ["--rate", "nan"], ["--widths", "1", "0"]]:
+        with pytest.raises(UserError, match=wrong[-1] if len(wrong) > 1 else "--rate"):
             parse(*wrong)
 
 

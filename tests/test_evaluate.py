@@ -46,6 +46,13 @@ def test_wilson_interval_against_published_values(successes, n, low, high):
     assert rate["low"] == pytest.approx(low, abs=2e-4) and rate["high"] == pytest.approx(high, abs=2e-4)
 
 
+@pytest.mark.parametrize("n", [200, 300, 500, 2000])
+def test_wilson_interval_holds_the_rate(n):
+    for successes in 0, 1, n - 1, n:
+        rate = tables.wilson([1] * successes + [0] * (n - successes))
+        assert 0 <= rate["low"] <= rate["mean"] <= rate["high"] <= 1
+
+
 def test_paired_difference_is_narrower_than_the_independent_one():
     a = np.random.default_rng(0).random(1000) < 0.8
     b = a.copy()
@@ -76,9 +83,12 @@ def test_every_method_meets_the_same_episodes(short):
 def test_the_occlusion_changes_nothing_but_what_is_hidden(short):
     play = players()
     none, full = (first_rows(play, "end_to_end", occlusion=seconds)[0] for seconds in (0.0, math.inf))
-    np.testing.assert_array_equal(none[0]["o"], full[0]["o"])
-    assert not any(row["o"][:, 8].any() for row in none)
-    hidden = np.stack([row["o"][:, 8] for row in full])
+    none, full = (np.stack([row["o"] for row in rows]) for rows in (none, full))
+    assert not none[..., 8].any()
+    hidden = full[..., 8]
+    for world, t in enumerate(hidden.argmax(0)):
+        np.testing.assert_array_equal(none[:t, world], full[:t, world])
+        np.testing.assert_array_equal(none[t, world, 4:8], full[t, world, 4:8])  # pusher and force
     assert hidden.any() and not (np.diff(hidden[:, hidden.any(0)], axis=0)[:8] < 0).any()
 
 

@@ -260,6 +260,12 @@ def test_a_run_is_logged_and_filmed_and_its_film_can_be_the_camera(robot, nets):
     assert len(again["time"]) >= ticks - 3 and np.linalg.norm((again["true"] - log["true"][:len(again["true"])])[:20, :2]).max() < 2e-3
 
 
+def test_force_deletes_no_other_scenario(robot):
+    folder = robot("--scenario", "natural", seed=23)[3]
+    _, stderr, code, _ = robot("--scenario", "hand_5s", "--force", seed=23)
+    assert code == 2 and "--scenario all" in mistakes(stderr)[0] and (folder / "natural_000.npz").exists()
+
+
 def test_a_damaged_log_is_named(robot):
     folder = robot("--scenario", "natural", seed=22)[3]
     (folder / "natural_000.npz").write_bytes(b"")

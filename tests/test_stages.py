@@ -211,9 +211,10 @@ def test_results_have_every_number(study):
 def test_the_ablation_is_measured_on_the_test_set(study):
     folder, draws = study / "smoke" / "02_collect" / "seed0", importlib.import_module("05_evaluate").LIST
     test = trajectories.load(*(folder / file for file in trajectories.files("test")))
-    f = networks.load_estimator(study / "smoke/03_train_estimator/mse/seed0/estimator.safetensors")
+    f = {m: networks.load_estimator(study / f"smoke/03_train_estimator/{m}/seed0/estimator.safetensors") for m in ESTIMATORS}
     results = json.loads((study / "smoke/05_evaluate/seed0/results.json").read_text())["estimator_ablation"]
-    for name, predict in ("vision", lambda o: o[..., :4]), ("mse", lambda o: f(o)[0]):
+    predictions = {"vision": lambda o: o[..., :4], "ours": lambda o: f["ours"].predict(o, passes=200)[0]}
+    for name, predict in (predictions | {m: lambda o, m=m: f[m](o)[0] for m in ("mse", "likelihood")}).items():
         table = tables.error_table(trajectories.measure(test, 12, 100, draws, "cpu", predict))
         for got, want in [(results[name], table), *((results[name][part], table[part]) for part in ("seen", "occluded"))]:
             for row, reference in ((got, want), (got["half_95"], want["half_95"])):
@@ -335,6 +336,25 @@ def test_a_damaged_input_names_its_stage(copy, call, script, file, needed, damag
         case "changed":
             path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     assert is_mistake(*call(out, script), "missing or damaged", f"run {needed}", "--force")
+
+
+@pytest.mark.parametrize("script, method, args, words", [
+    ("01_train_privileged", "", ("--lr", "1e30", "--lr-max", "1e30"), "diverged in update"),
+    ("03_train_estimator", "mse", ("--lr", "1e30", "--lr-end", "1e30"), "diverged in epoch")])
+def test_a_training_that_diverged_does_not_finish(copy, call, script, method, args, words):
+    out = copy(SCRIPTS.index(script))
+    stdout, stderr, code = call(out, script, "--seed", "1", *(("--method", method) if method else ()), *args)
+    assert code == 2 and words in stderr and "Traceback" not in stderr
+    assert not artifacts.record_of(None, out / "smoke" / script / method / "seed1")["finished"]
+
+
+@pytest.mark.parametrize("script, args, words", [
+    ("01_train_privileged", ("--device", "cuda"), "no GPU"), ("02_collect", ("--device", "cuda"), "no GPU"),
+    ("03_train_estimator", ("--dropout", "1"), "below 1"), ("04_train_policy", ("--sizes", "8", "8", "8"), "--no-warm-start")])
+def test_a_mistake_costs_no_run(study, call, script, args, words, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert is_mistake(*call(study, script, "--force", *args), words)
+    assert all((study / "smoke" / folder / name).exists() for folder, names in OUTPUTS.items() for name in names)
 
 
 def test_a_stale_input_names_the_stage_to_redo(copy, call):
