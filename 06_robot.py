@@ -240,8 +240,9 @@ def main(cfg):
     finally:
         arm.stop()
     bar.close()
-    artifacts.save_json(run.dir / "summary.json", tables.robot_runs(logs))
-    print(f"\n{tables.robot(tables.robot_runs(logs))}\n\nfigure, logs and summary.json: {run.dir}")
+    summary = tables.robot_runs(logs)
+    artifacts.save_json(run.dir / "summary.json", summary)  # a kill may have come between the last log and its summary
+    print(f"\n{tables.robot(summary)}\n\nfigure, logs and summary.json: {run.dir}")
     run.finish(["summary.json"])
 
 

@@ -60,15 +60,14 @@ def curves(folder, x, y):
 
 
 def band(ax, folder, x, y, label, color, x_scale=1.0, y_scale=1.0, **kw):
-    """Mean over seeds, and one standard deviation to either side where there are several; says whether there was a run."""
+    """Mean over seeds, and one standard deviation to either side where there are several."""
     xs, ys = curves(folder, x, y)
     if xs is None:
-        return False
+        return
     xs, mean, std, count = xs * x_scale, ys.mean(0) * y_scale, ys.std(0) * y_scale, len(ys)
     ax.plot(xs, mean, color=color, label=f"{label}, {count} seed{'s' * (count > 1)}", **kw)
     if count > 1:
         ax.fill_between(xs, mean - std, mean + std, color=color, alpha=0.2, lw=0)
-    return True
 
 
 def success_axis(ax):
@@ -79,10 +78,11 @@ def success_rate_priv(study, path):
     """Fig. success_rate_priv: held-out success of pi_priv over training."""
     figure, ax = new(5, 3)
     name, color, _ = METHODS["priv_on_state"]
-    if band(ax, study / "01_train_privileged", "steps", "success", name, color, 1e-6, 100):
-        ax.legend(loc="lower right")
+    band(ax, study / "01_train_privileged", "steps", "success", name, color, 1e-6, 100)
     ax.set(xlabel="environment steps (millions)")
     success_axis(ax)
+    if ax.lines:
+        ax.legend(loc="lower right")
     save(figure, path)
 
 
@@ -118,11 +118,11 @@ def validation_loss(study, name, path):
     """Figs. likelihood_loss, mse_loss and bc_loss, by `name`: validation loss over epochs."""
     figure, ax = new(5, 3)
     stage, shown, ylabel = LOSSES[name]
-    found = [band(ax, study / stage / method, "epoch", "validation_loss", label, color, marker="o", ms=3)
-             for method, (label, color) in shown.items()]
+    for method, (label, color) in shown.items():
+        band(ax, study / stage / method, "epoch", "validation_loss", label, color, marker="o", ms=3)
     ax.set(xlabel="epoch", ylabel=f"validation {ylabel}", yscale="log" if name == "mse_loss" else "linear")
     ax.xaxis.get_major_locator().set_params(integer=True)
-    if any(found):
+    if ax.lines:
         ax.legend()
     save(figure, path)
 

@@ -271,12 +271,12 @@ def update(actor, critic, optimizers, seq, hp):
 @contextmanager
 def one_thread():
     """Policy and value have a thread each; more within them would only wait for each other."""
-    threads = torch.get_num_threads()
+    before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(before)
 
 
 @one_thread()
@@ -298,6 +298,7 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
     aids = env.unwrapped
     aids.tolerance = hp.tolerance
     optimizers = [torch.optim.Adam(net.parameters(), lr=hp.lr, eps=1e-5) for net in (actor, critic)]
+    kl_end = hp.kl_target if hp.kl_target_end is None else hp.kl_target_end
     first, ended, successes = 0, 0, 0
     if state := run.load_resume():
         actor.load_state_dict(state["actor"]), critic.load_state_dict(state["critic"])
@@ -335,7 +336,7 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
             carry = obs, actor.initial(hp.num_envs, device), critic.initial(hp.num_envs, device)
         batch, carry = rollout(env, actor, critic, carry, hp.rollout_steps)
         seq = sequences(batch, critic, hp.gamma, hp.lam)
-        kl_target = hp.kl_target + ((hp.kl_target_end or hp.kl_target) - hp.kl_target) * k / hp.updates
+        kl_target = hp.kl_target + (kl_end - hp.kl_target) * k / hp.updates
         stats = update(actor, critic, optimizers, seq, replace(hp, kl_target=kl_target)) | {"explained": seq["explained"]}
         if not math.isfinite(stats["kl"] + stats["value_loss"]):
             raise artifacts.UserError(f"{run.dir}: training diverged in update {k + 1}: use a lower rate, and --force")

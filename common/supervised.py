@@ -23,7 +23,8 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
         True when trained to the end, False when the time limit stopped it.
     """
     optimizer = torch.optim.Adam(net.parameters(), lr=lr)
-    count, first, best, lr_end = len(data[1]) - 1, 0, math.inf, lr if lr_end is None else lr_end
+    lr_end = lr if lr_end is None else lr_end
+    count, first, best = len(data[1]) - 1, 0, math.inf
     if state := run.load_resume():
         net.load_state_dict(state["net"]), optimizer.load_state_dict(state["optimizer"])
         first, best = state["epoch"], state["best"]
