@@ -54,14 +54,12 @@ def train(run, cfg, train_set, validation_set, device):
     dropout = cfg.dropout if cfg.method == "ours" else 0.0
     f = networks.Estimator(cfg.sizes, dropout, cfg.method != "mse").to(device)
 
-    def loss(data, index, seed):
-        o, s, mask = trajectories.observe(data, index, seed, device)
-        some = slice(seed[2] % min(STRIDE, len(o)), None, STRIDE)
+    def loss(o, s, mask, generator):
+        some = slice(generator.initial_seed() % min(STRIDE, len(o)), None, STRIDE)
         with networks.autocast(device):
-            q_hat, log_var = f.head(f.lstm(o)[0][some])
+            q_hat, log_var = f.head(f.lstm(o)[0][some], generator)
         q, valid = s[some, :, :4], mask[some]
-        error = networks.nll(q_hat, log_var, q, valid) if f.likelihood else networks.mse(q_hat, q, valid)
-        return error, mask.sum().item()
+        return networks.nll(q_hat, log_var, q, valid) if f.likelihood else networks.mse(q_hat, q, valid)
 
     return supervised.fit(
         run, f, loss, lambda: networks.save_estimator(run.dir / "estimator.safetensors", f), train_set, validation_set,

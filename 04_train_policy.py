@@ -96,9 +96,8 @@ def train_bc(run, cfg, paths, device):
     torch.manual_seed(cfg.seed)
     student = networks.policy(9, cfg.sizes).to(device)
 
-    def loss(data, index, seed):
+    def loss(o, s, mask, generator):
         """Sum over both velocities of the cross-entropy with the teacher's distribution."""
-        o, s, mask = trajectories.observe(data, index, seed, device)
         off = symmetry.signs(s[0].cpu().numpy())  # the teacher acted in the frame of the true start
         s_teacher = torch.as_tensor(symmetry.mirror(s.cpu().numpy(), off), device=device)
         flipped = torch.as_tensor(off < 0, device=device)[None, :, :, None]
@@ -107,8 +106,7 @@ def train_bc(run, cfg, paths, device):
                 target = networks.log_softmax(teacher(s_teacher)[0]).exp()
             target = torch.where(flipped, target.flip(-1), target)
             logp = networks.log_softmax(student(o)[0])
-        steps = mask.sum()
-        return (-(target * logp).sum((-1, -2)) * mask).sum() / steps, steps.item()
+        return (-(target * logp).sum((-1, -2)) * mask).sum() / mask.sum()
 
     done = supervised.fit(
         run, student, loss, lambda: networks.save_recurrent(run.dir / "policy.safetensors", student),

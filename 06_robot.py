@@ -213,7 +213,7 @@ def main(cfg):
     if cfg.print_tags:
         tags.print_sheet(cfg.out / "tags.pdf")
         return print(f"{cfg.out / 'tags.pdf'}: print it at 100 %, and measure the ruler")
-    torch.set_num_threads(1), cv2.setNumThreads(1)  # nets and images are small, and threads wait for each other
+    cv2.setNumThreads(1)  # images are small, and threads wait for each other
     paths = {"estimator": artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", "ours"),
              "policy": artifacts.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty")}
     f, pi = networks.load_estimator(paths["estimator"]), networks.load_recurrent(paths["policy"])

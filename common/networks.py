@@ -9,7 +9,10 @@ from common import artifacts
 from common.task import BINS
 
 LOG_VAR = (-14.0, 4.0)  # clamp of the predicted log-variances
-threads = ThreadPoolExecutor(2)  # for whole nets or passes side by side, where torch itself has one; no job waits for another
+# torch's threads wait for each other at every operation, and for any other job of the machine: one, and two above it for
+# whole nets, passes or halves of a mini-batch side by side; no job of theirs waits for another
+torch.set_num_threads(1)
+threads = ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(1,))
 
 
 def autocast(device):
@@ -158,7 +161,7 @@ class Estimator(nn.Module):
             with torch.autocast(z.device.type, torch.bfloat16, enabled=z.dtype == torch.bfloat16):
                 return self.head(z.expand(count, *z.shape), torch.Generator(z.device).manual_seed(seed))
 
-        q, log_var = zip(*(threads.map if torch.get_num_threads() == 1 else map)(several, counts, seeds))
+        q, log_var = zip(*(threads.map if z.device.type == "cpu" else map)(several, counts, seeds))
         return *predictive(torch.cat(q), torch.cat(log_var) if self.likelihood else None), hidden
 
 

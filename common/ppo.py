@@ -4,7 +4,6 @@ PPO sees only a vector env: every policy of the study is another stack of wrappe
 """
 import math
 import time
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -239,8 +238,7 @@ def _descend(net, optimizer, loss, seq, batches, hp):
 def update(actor, critic, optimizers, seq, hp):
     """`hp.epochs` passes of PPO over a rollout's sequences; the learning rate follows the KL of the last pass.
 
-    The two nets share nothing: each descends in a thread of its own, which on two cores is twice as fast as one after the
-    other with two threads inside.
+    The two nets share nothing: each descends in a thread of its own.
 
     Args:
         optimizers: of actor and critic.
@@ -268,18 +266,6 @@ def update(actor, critic, optimizers, seq, hp):
             "lr": lr}
 
 
-@contextmanager
-def one_thread():
-    """Policy and value have a thread each; more within them would only wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@one_thread()
 def train(run, hp, env, held_out, actor, critic, keep=None):
     """PPO from the last resume point to `hp.updates`; every `hp.eval_every` updates a row of metrics.
 

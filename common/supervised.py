@@ -5,6 +5,13 @@ import numpy as np
 import torch
 
 from common import artifacts, trajectories
+from common.networks import threads
+
+
+def halves(batch):
+    """A batch in two, trajectory by trajectory, for two threads; on a GPU, or with one trajectory, it stays whole."""
+    count = 1 if batch[0].is_cuda else min(2, batch[0].shape[1])
+    return [[x[:, i::count].contiguous() for x in batch] for i in range(count)]
 
 
 def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr_end, grad_norm, validation):
@@ -12,8 +19,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
 
     Args:
         run: artifacts.Run; metrics get a row an epoch.
-        loss: loss(data, index, (seed, epoch, mini-batch, purpose)) returns the loss, averaged over the steps it looks at,
-            and the number of valid steps.
+        loss: loss(o, s, mask, generator) of a batch of trajectories.observe, averaged over the steps it looks at.
         save: called after each epoch with the lowest validation loss so far.
         data, held_out: trajectories to train and to validate on.
         sequences, epochs, lr, lr_end (none: lr), grad_norm, validation: as in the stages' Config.
@@ -22,7 +28,8 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
     Returns:
         True when trained to the end, False when the time limit stopped it.
     """
-    optimizer = torch.optim.Adam(net.parameters(), lr=lr)
+    parameters = list(net.parameters())
+    device, optimizer = parameters[0].device, torch.optim.Adam(parameters, lr=lr)
     lr_end = lr if lr_end is None else lr_end
     count, first, best = len(data[1]) - 1, 0, math.inf
     if state := run.load_resume():
@@ -30,26 +37,38 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
         first, best = state["epoch"], state["best"]
     updates, usual = math.ceil(count / sequences), data[1][-1] / count * sequences  # steps of a mini-batch
     bar = artifacts.bar(epochs * updates, run.dir.parent.name, initial=first * updates, unit="update")
+
+    def value_of(batch, draw):
+        """Loss of a batch and its number of valid steps."""
+        return loss(*batch, torch.Generator(device).manual_seed(draw)), batch[2].sum().item()
+
+    def descent(batch, draw):
+        """Loss, valid steps and gradients of a part of a mini-batch: a step counts the same in each, clipped or not."""
+        value, steps = value_of(batch, draw)
+        return value.item(), steps, torch.autograd.grad(value * (steps / usual), parameters)
+
     for epoch in range(first, epochs):
         rng = np.random.default_rng([seed, epoch])
-        torch.manual_seed(int(rng.integers(2**62)))
         losses, weights = [], []
         for k, index in enumerate(trajectories.shuffled(data, sequences, rng)):
             progress = (epoch + k / updates) / epochs
             optimizer.param_groups[0]["lr"] = lr_end + (lr - lr_end) * (1 + math.cos(math.pi * progress)) / 2
-            value, steps = loss(data, index, (seed, epoch, k, 1))  # the last number keeps apart what the seeds are for
-            optimizer.zero_grad(set_to_none=True)
-            share = steps / usual  # a step counts the same in every mini-batch, clipped or not
-            (value * share).backward()
-            torch.nn.utils.clip_grad_norm_(net.parameters(), grad_norm * share)
+            # the last number of the seed keeps apart what it is for
+            parts = halves(trajectories.observe(data, index, (seed, epoch, k, 1), device))
+            jobs = [threads.submit(descent, part, int(rng.integers(2**62))) for part in parts]
+            values, steps, gradients = zip(*(job.result() for job in jobs))
+            for parameter, *shares in zip(parameters, *gradients):
+                parameter.grad = sum(shares)
+            torch.nn.utils.clip_grad_norm_(parameters, grad_norm * sum(steps) / usual)
             optimizer.step()
-            losses.append(value.item()), weights.append(steps)
+            losses += values
+            weights += steps
             bar.update()
             bar.set_postfix_str(f"loss {losses[-1]:.3f}", refresh=False)
-        torch.manual_seed(seed)
         with torch.no_grad():  # the same noise, occlusions and dropout every epoch
             batches = trajectories.batches(trajectories.subset(held_out, validation), sequences)
-            values, steps = zip(*(loss(held_out, index, (0, 0, k, 2)) for k, index in enumerate(batches)))
+            values, steps = zip(*(value_of(trajectories.observe(held_out, index, (0, 0, k, 2), device), k)
+                                  for k, index in enumerate(batches)))
         validation_loss = float(np.average([v.item() for v in values], weights=steps))
         if not math.isfinite(validation_loss):
             raise artifacts.UserError(f"{run.dir}: training diverged in epoch {epoch + 1}: use a lower rate, and --force")

@@ -40,9 +40,8 @@ def play(env, steps=10):
     return lambda: [env.step(actions[rng.integers(100)]) for _ in range(steps)], steps * env.num_envs
 
 
-@ppo.one_thread()
 def learn(what, preset, **changes):
-    """Rollout and update of pi_priv's nets, with the threads of ppo.train."""
+    """Rollout and update of pi_priv's nets."""
     stage = importlib.import_module("01_train_privileged")
     hp = stage.Config(**stage.PRESETS[preset] | changes)
     env = stacks.make("priv_on_state", hp.num_envs)
@@ -67,7 +66,7 @@ def learn(what, preset, **changes):
 
 def main():
     where = torch.backends.cpu.get_cpu_capability()
-    print(f"torch {torch.__version__}, {torch.get_num_threads()} threads, {where}, "
+    print(f"torch {torch.__version__}, {where}, "
           f"bfloat16 {'yes' if torch.cpu._is_avx512_bf16_supported() else 'no'}\n")
     env = PushEnv()
     env.reset(seed=0)

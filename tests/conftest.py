@@ -5,7 +5,6 @@ import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-torch.set_num_threads(1)  # the nets of the tests are small, and two threads wait for each other when the machine is busy
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 from common import artifacts, episodes, film, networks, stacks, tables, task
@@ -23,7 +22,6 @@ robot = importlib.import_module("06_robot")
 
 
 def main(cfg):
-    torch.set_num_threads(1)
     folder = artifacts.run_folder(cfg.own, "06_robot", None, cfg.seed)
     logs = runlog.read(folder, "natural")
     if not logs:

@@ -106,7 +106,7 @@ def test_many_passes_of_many_worlds_are_taken_in_parts():
     f, passes = small(), []
     f.layers[-1].register_forward_hook(lambda m, x, y: passes.append(len(y)))
     mean, _, _ = f.predict(torch.randn(2, 2**13, 9), passes=5)
-    assert passes == [2, 2, 1] and mean.shape == (2, 2**13, 4)
+    assert sorted(passes) == [1, 2, 2] and mean.shape == (2, 2**13, 4)
 
 
 def test_without_dropout_passes_agree_and_mse_knows_no_variance():
