@@ -55,7 +55,7 @@ def train(run, cfg, train_set, validation_set, device):
     f = networks.Estimator(cfg.sizes, dropout, cfg.method != "mse").to(device)
 
     def loss(o, s, mask, generator):
-        some = slice(generator.initial_seed() % min(STRIDE, len(o)), None, STRIDE)
+        some = slice(generator.initial_seed() % min(STRIDE, len(o)), None, STRIDE)  # a first step for each seed
         with networks.autocast(device):
             q_hat, log_var = f.head(f.lstm(o)[0][some], generator)
         q, valid = s[some, :, :4], mask[some]

@@ -104,8 +104,8 @@ def parse(config_class: type, presets: dict[str, dict], doc: str, args: list[str
 
 
 def keep_memory():
-    """Freed memory stays with the process, where the C library is glibc: a training frees and takes arrays of the same
-    sizes all the time, and the kernel would zero every page anew (a fifth of the time of PPO).
+    """Freed memory stays with the process (of a thread: blocks below 64 MB), where the C library is glibc: a training frees
+    and takes arrays of the same sizes all the time, and the kernel would zero every page anew (a fifth of the time of PPO).
     """
     with contextlib.suppress(AttributeError, OSError, TypeError):
         mallopt = ctypes.CDLL(None).mallopt

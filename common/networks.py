@@ -9,17 +9,20 @@ from common import artifacts
 from common.task import BINS
 
 LOG_VAR = (-14.0, 4.0)  # clamp of the predicted log-variances
-# torch's threads wait for each other at every operation, and for any other job of the machine: one, and two above it for
-# whole nets, passes or halves of a mini-batch side by side; no job of theirs waits for another
+# torch computes each operation in one thread: more would wait for each other at each, and for any other job of the machine.
+# This pool runs two independent jobs: nets, passes or halves of a mini-batch. A job must not wait for another.
 torch.set_num_threads(1)
-threads = ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(1,))
+threads = ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(1,))  # OpenMP keeps the number per thread
 
 
 def autocast(device):
-    """bfloat16 autocast on a CPU that computes in it, else float32: CUDA's runs an LSTM in float16, too coarse for PPO."""
+    """bfloat16 autocast on a CPU that computes in it, else float32: CUDA's runs an LSTM in float16, too coarse for PPO.
+
+    Its cache of weights is off: it would share their graph between threads.
+    """
     device = torch.device(device)
     fast = device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
-    return torch.autocast(device.type, torch.bfloat16, enabled=fast)
+    return torch.autocast(device.type, torch.bfloat16, enabled=fast, cache_enabled=False)
 
 
 class Recurrent(nn.Module):
@@ -155,10 +158,11 @@ class Estimator(nn.Module):
         passes = passes if self.dropout else 1
         at_once = min(max(1, 2**15 // (z.shape[0] * z.shape[1])), (passes + 1) // 2)  # the first bounds the memory
         counts = [min(at_once, passes - i) for i in range(0, passes, at_once)]
-        seeds = torch.randint(2**62, (len(counts),)).tolist()
+        seeds, graph = torch.randint(2**62, (len(counts),)).tolist(), torch.is_grad_enabled()
 
-        def several(count, seed):
-            with torch.autocast(z.device.type, torch.bfloat16, enabled=z.dtype == torch.bfloat16):
+        def several(count, seed):  # in a thread that knows no autocast or no_grad of ours
+            fast = z.dtype == torch.bfloat16
+            with torch.set_grad_enabled(graph), torch.autocast(z.device.type, torch.bfloat16, enabled=fast, cache_enabled=False):
                 return self.head(z.expand(count, *z.shape), torch.Generator(z.device).manual_seed(seed))
 
         q, log_var = zip(*(threads.map if z.device.type == "cpu" else map)(several, counts, seeds))

@@ -9,9 +9,11 @@ from common.networks import threads
 
 
 def halves(batch):
-    """A batch in two, trajectory by trajectory, for two threads; on a GPU, or with one trajectory, it stays whole."""
-    count = 1 if batch[0].is_cuda else min(2, batch[0].shape[1])
-    return [[x[:, i::count].contiguous() for x in batch] for i in range(count)]
+    """A batch in two for two threads, each as long as its longest trajectory; on a GPU, or with one trajectory, it stays whole."""
+    if batch[0].is_cuda or batch[0].shape[1] == 1:
+        return [batch]
+    parts = [[x[:, i::2] for x in batch] for i in range(2)]
+    return [[x[:int(part[2].sum(0).max())].contiguous() for x in part] for part in parts]
 
 
 def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr_end, grad_norm, validation):
@@ -19,7 +21,8 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
 
     Args:
         run: artifacts.Run; metrics get a row an epoch.
-        loss: loss(o, s, mask, generator) of a batch of trajectories.observe, averaged over the steps it looks at.
+        loss: loss(o, s, mask, generator) of a batch of trajectories.observe, averaged over the steps it looks at. It runs in
+            two threads at once, draws from the generator alone, and needs every parameter.
         save: called after each epoch with the lowest validation loss so far.
         data, held_out: trajectories to train and to validate on.
         sequences, epochs, lr, lr_end (none: lr), grad_norm, validation: as in the stages' Config.
@@ -38,13 +41,13 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
     updates, usual = math.ceil(count / sequences), data[1][-1] / count * sequences  # steps of a mini-batch
     bar = artifacts.bar(epochs * updates, run.dir.parent.name, initial=first * updates, unit="update")
 
-    def value_of(batch, draw):
-        """Loss of a batch and its number of valid steps."""
-        return loss(*batch, torch.Generator(device).manual_seed(draw)), batch[2].sum().item()
+    def value_of(batch, draws):
+        """Loss of a batch and its number of valid steps; `draws` seeds what the loss draws."""
+        return loss(*batch, torch.Generator(device).manual_seed(draws)), batch[2].sum().item()
 
-    def descent(batch, draw):
+    def descent(batch, draws):
         """Loss, valid steps and gradients of a part of a mini-batch: a step counts the same in each, clipped or not."""
-        value, steps = value_of(batch, draw)
+        value, steps = value_of(batch, draws)
         return value.item(), steps, torch.autograd.grad(value * (steps / usual), parameters)
 
     for epoch in range(first, epochs):

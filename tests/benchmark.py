@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-from common import networks, ppo, stacks  # noqa: E402
+from common import artifacts, networks, ppo, stacks  # noqa: E402
 from common.env import PushEnv, PushVectorEnv  # noqa: E402
 from common.observation import ObservationModel, Observed  # noqa: E402
 
@@ -65,6 +65,7 @@ def learn(what, preset, **changes):
 
 
 def main():
+    artifacts.keep_memory()
     where = torch.backends.cpu.get_cpu_capability()
     print(f"torch {torch.__version__}, {where}, "
           f"bfloat16 {'yes' if torch.cpu._is_avx512_bf16_supported() else 'no'}\n")

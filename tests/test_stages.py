@@ -2,7 +2,6 @@
 import csv
 import importlib
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -40,8 +39,7 @@ OUTPUTS = {
 
 def start(out, script, *args):
     command = [sys.executable, ROOT / f"{script}.py", "smoke", "--out", out, "--device", "cpu", *args]
-    return subprocess.Popen(command, env=os.environ | {"OMP_NUM_THREADS": "1"}, cwd=out.parent, text=True,
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return subprocess.Popen(command, cwd=out.parent, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 def run(out, script, *args):
