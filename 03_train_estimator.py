@@ -3,8 +3,8 @@
     python 03_train_estimator.py [smoke|quick|laptop|paper] [--method ours|likelihood|mse] [--seed k] [--field value ...]
 
 Reads the train and validation sets of 02. Writes runs/<preset>/03_train_estimator/<method>/seed<k>/: estimator.safetensors
-(the epoch of the lowest validation loss), metrics.csv, likelihood_loss.png or mse_loss.png, and for ours passes.json and
-passes.png: the error against M. Without --method all three are trained in turn.
+(the epoch of the lowest validation loss), metrics.csv, likelihood_loss.png or mse_loss.png, passes.json: its errors in mm
+and degrees on the validation set, for ours against M, and passes.png. Without --method all three are trained in turn.
 """
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -68,15 +68,16 @@ def train(run, cfg, train_set, validation_set, device):
 
 
 def error_against_passes(estimator, data, cfg, device):
-    """Errors on the validation set for each M of GRID."""
+    """Errors on the validation set for each M of GRID; without dropout for M = 1, as every pass is the same."""
     def predict(passes):
         def poses(o):
             with networks.autocast(o.device):
                 return estimator.predict(o, passes=passes)[0]
         return poses
 
-    sums = {m: trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, predict(m)) for m in GRID}
-    return {m: tables.error_table(sums[m]) for m in GRID}
+    grid = GRID if estimator.dropout else (1,)
+    sums = {m: trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, predict(m)) for m in grid}
+    return {m: tables.error_table(sums[m]) for m in grid}
 
 
 def main(cfg):
@@ -92,18 +93,18 @@ def main(cfg):
             continue
         if not train(run, cfg, train_set, validation_set, device):
             return
-        outputs = ["estimator.safetensors"]
-        if method == "ours":
-            torch.manual_seed(cfg.seed)
-            estimator = networks.load_estimator(run.dir / "estimator.safetensors", device)
-            errors = error_against_passes(estimator, validation_set, cfg, device)
-            artifacts.save_json(run.dir / "passes.json", errors)
+        torch.manual_seed(cfg.seed)
+        estimator = networks.load_estimator(run.dir / "estimator.safetensors", device)
+        errors = error_against_passes(estimator, validation_set, cfg, device)
+        artifacts.save_json(run.dir / "passes.json", errors)
+        if len(errors) > 1:
             plots.passes(errors, run.dir / "passes.png")
-            outputs.append("passes.json")
         name = "mse_loss" if method == "mse" else "likelihood_loss"
         plots.validation_loss(cfg.own, name, run.dir / f"{name}.png")
-        run.finish(outputs, **supervised.outcome(run))
-        print(f"{run.dir}: validation loss {run.record['validation_loss']:.4f}")
+        run.finish(["estimator.safetensors", "passes.json"], **supervised.outcome(run))
+        last = errors[max(errors)]
+        print(f"{run.dir}: validation loss {run.record['validation_loss']:.4f}, "
+              f"error {last['trans_mean_l2_mm']:.2f} mm and {last['rot_mean_abs_deg']:.2f} degrees (M = {max(errors)})")
 
 
 if __name__ == "__main__":

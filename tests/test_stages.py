@@ -27,8 +27,8 @@ OUTPUTS = {
                                   "checkpoint_001.safetensors", "checkpoint_002.safetensors", "success_rate_priv.png"],
     "02_collect/seed0": [file for name in SETS for file in trajectories.files(name)] + ["success.png"],
     "03_train_estimator/ours/seed0": ["estimator.safetensors", "likelihood_loss.png", "passes.json", "passes.png"],
-    "03_train_estimator/likelihood/seed0": ["estimator.safetensors", "likelihood_loss.png"],
-    "03_train_estimator/mse/seed0": ["estimator.safetensors", "mse_loss.png"],
+    "03_train_estimator/likelihood/seed0": ["estimator.safetensors", "likelihood_loss.png", "passes.json"],
+    "03_train_estimator/mse/seed0": ["estimator.safetensors", "mse_loss.png", "passes.json"],
     "04_train_policy/behavior_cloning/seed0": ["policy.safetensors", "bc_loss.png"],
     "05_evaluate/seed0": ["results.json", "tables.md", "success_rate.png", "occlusion_duration.png", "sim.png",
                           "trajectory_with_uncertainty.png", "film.mp4", "film.gif", "success_rate_priv.png",
@@ -180,9 +180,10 @@ def test_inputs_are_recorded(study):
     assert "01_train_privileged/seed0/policy.safetensors" in inputs
 
 
-def test_errors_against_passes(study):
-    errors = json.loads((study / "smoke/03_train_estimator/ours/seed0/passes.json").read_text())
-    assert list(errors) == ["1", "2", "5", "10", "20", "50"]
+@pytest.mark.parametrize("method, grid", [("ours", ["1", "2", "5", "10", "20", "50"]), ("likelihood", ["1"]), ("mse", ["1"])])
+def test_errors_against_passes(study, method, grid):
+    errors = json.loads((study / f"smoke/03_train_estimator/{method}/seed0/passes.json").read_text())
+    assert list(errors) == grid
     assert all(row["trans_mean_l2_mm"] > 0 and row["seen"]["rot_rmse_deg"] > 0 for row in errors.values())
 
 

@@ -55,7 +55,7 @@ def _looking(position, at, right):
 # The robot's camera: beside the stem, 0.2 m above the ball and looking at it; 60 degrees wide. World frame, tool pointing down
 FOCAL, SIZE = 550.0, (640, 480)
 MOUNT = np.array([0.05, -0.05, 0.20])  # m, from the centre of the ball
-_LOOK = _looking(MOUNT, np.zeros(3), np.array([1.0, 0.0, 0.0]))
+LOOK = _looking(MOUNT, np.zeros(3), np.array([1.0, 0.0, 0.0]))  # its axes (right, down, forward) as columns
 _BESIDE = np.array([0.75, 0.95, 0.75])
 OVERVIEW = Camera(780.0, SIZE, _looking(_BESIDE, np.array([0.0, -0.1, 0.2]), np.array([-1.0, 0.75, 0.0])), _BESIDE)  # for figures
 
@@ -67,7 +67,7 @@ def wrist_camera(points, rotation, error=np.zeros(6)):
         error: (6,) what hand-eye calibration missed: a shift in m and a rotation vector in rad about the camera, tool frame.
     """
     turn = rotation @ cv2.Rodrigues(error[3:])[0] @ iiwa.DOWN.T
-    return Camera(FOCAL, SIZE, turn @ _LOOK, points[7] + rotation @ (iiwa.DOWN.T @ MOUNT + error[:3]))
+    return Camera(FOCAL, SIZE, turn @ LOOK, points[7] + rotation @ (iiwa.DOWN.T @ MOUNT + error[:3]))
 
 
 def _table():
