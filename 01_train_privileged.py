@@ -3,39 +3,40 @@
     python 01_train_privileged.py [smoke|quick|laptop|paper] [--seed k] [--field value ...]
 
 Writes runs/<preset>/01_train_privileged/seed<k>/: policy.safetensors, value.safetensors, checkpoint_*.safetensors
-(uniformly spaced over training, the untrained net first), metrics.csv, success_rate_priv.png (all seeds that are there).
-Resumes where it stopped.
+(uniformly spaced over training, the untrained net first), metrics.csv, training.png, success_rate_priv.png (all seeds that
+are there). Resumes where it stopped.
 """
 from dataclasses import dataclass
 
 import torch
 
-from common import artifacts, networks, plots, ppo, stacks
+from common import command, networks, plots, ppo, runs, stacks, training, weights
+from common.files import UserError
 
 
 @dataclass
-class Config(ppo.Hyperparameters, artifacts.Stage):
-    checkpoints: int = 300
-    """uniformly spaced checkpoints of pi_priv, the untrained and the last included (sec. 4)"""
+class Config(ppo.Hyperparameters, command.Stage):
+    checkpoints: int = 300  # uniformly spaced checkpoints of pi_priv, the untrained and the last included (sec. 4)
 
 
 PRESETS = {
     "smoke": dict(num_envs=32, rollout_steps=16, updates=6, minibatch=256, epochs=2, sizes=(16, 16, 16), checkpoints=3,
                   eval_every=3, eval_episodes=16, resume_every=2, tolerance=4.0, near_share=0.5),
     "quick": dict(num_envs=1024, rollout_steps=32, updates=500, minibatch=4096, epochs=3, sizes=(64, 128, 64),
-                  checkpoints=26, entropy=0.002, kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.8),
-    "laptop": dict(num_envs=1024, rollout_steps=32, updates=1000, minibatch=4096, epochs=3, checkpoints=100, entropy=0.002,
-                   kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.8),
+                  checkpoints=26, entropy_coef=0.002, kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0,
+                  near_share=0.8),
+    "laptop": dict(num_envs=1024, rollout_steps=32, updates=1000, minibatch=4096, epochs=3, checkpoints=100,
+                   entropy_coef=0.002, kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.8),
     "paper": {},
 }
 
 
 def main(cfg):
-    most = min(1000, cfg.updates + 1)
-    if not 2 <= cfg.checkpoints <= most:
-        raise artifacts.UserError(f"--checkpoints {cfg.checkpoints}: say 2 to {most}; at most --updates and one more, or 1000")
-    device = artifacts.device_of(cfg)
-    run = artifacts.Run(cfg, "01_train_privileged")
+    limit = min(1000, cfg.updates + 1)
+    if not 2 <= cfg.checkpoints <= limit:
+        raise UserError(f"--checkpoints {cfg.checkpoints}: say 2 to {limit}; at most --updates and one more, or 1000")
+    device = command.device_of(cfg)
+    run = runs.Run(cfg, "01_train_privileged")
     if run.skip():
         return
     torch.manual_seed(cfg.seed)
@@ -47,17 +48,18 @@ def main(cfg):
 
     def keep(update, actor):
         if update in spaced:
-            networks.save_recurrent(run.dir / names[spaced[update]], actor)
+            weights.save(run.dir / names[spaced[update]], actor)
 
-    env, held_out = (stacks.make("priv_on_state", n) for n in (cfg.num_envs, cfg.eval_episodes))
-    if not ppo.train(run, cfg, env, held_out, pi_priv, critic, keep):
+    env, held_out = (stacks.make(stacks.METHODS["priv_on_state"], n) for n in (cfg.num_envs, cfg.eval_episodes))
+    if not training.train(run, cfg, env, held_out, pi_priv, critic, keep):
         return
-    networks.save_recurrent(run.dir / "policy.safetensors", pi_priv)
-    networks.save_recurrent(run.dir / "value.safetensors", critic)
-    plots.success_rate_priv(cfg.own, run.dir / "success_rate_priv.png")
-    run.finish(["policy.safetensors", "value.safetensors", *names], **ppo.outcome(run))
+    weights.save(run.dir / "policy.safetensors", pi_priv)
+    weights.save(run.dir / "value.safetensors", critic)
+    plots.training(run.rows(), run.dir / "training.png")
+    plots.success_rate_priv(cfg.roots, run.dir / "success_rate_priv.png")
+    run.finish(["policy.safetensors", "value.safetensors", *names], **training.outcome(run))
     print(f"{run.dir}: pi_priv succeeds in {run.record['success']:.1%} of held-out episodes")
 
 
 if __name__ == "__main__":
-    artifacts.main(Config, PRESETS, main, __doc__)
+    command.main(Config, PRESETS, main, __doc__)

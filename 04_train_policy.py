@@ -1,45 +1,49 @@
 """Stage 04: the control policies under occlusion, each another stack over the same env (sec. 3.3, sec. 5.2).
 
     python 04_train_policy.py [smoke|quick|laptop|paper] [--method est_uncertainty|est|est_mse|end_to_end|behavior_cloning]
-        [--seed k] [--field value ...]
+        [--seed k] [--weights DIR] [--field value ...]
 
-Reads pi_priv (01), the teacher sets (02) and the estimators (03). Writes runs/<preset>/04_train_policy/<method>/seed<k>/:
-policy.safetensors, metrics.csv, and success_rate.png of all methods and seeds or bc_loss.png. Without --method all are
-trained in turn.
+Reads pi_priv (01), the teacher sets (02) and the estimators (03): those in the folder --weights, and the others of the same
+preset. Writes runs/<preset>/04_train_policy/<method>/seed<k>/: policy.safetensors, metrics.csv, training.png, and
+success_rate.png of all methods and seeds or bc_loss.png. Without --method all are trained in turn.
 """
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import torch
 
-from common import artifacts, networks, plots, ppo, stacks, supervised, symmetry, trajectories
+from common import command, networks, plots, ppo, runs, speed, stacks, supervised, symmetry, training, trajectories, weights
+from common.files import UserError
 
-METHODS = ("est_uncertainty", "est", "est_mse", "end_to_end", "behavior_cloning")
+METHODS = {name: method for name, method in stacks.METHODS.items() if method.training != "pi_priv"}
 
 
 @dataclass
-class Config(ppo.Hyperparameters, artifacts.Stage):
-    method: Literal["est_uncertainty", "est", "est_mse", "end_to_end", "behavior_cloning", "all"] = "all"
-    """which policy to train"""
-    passes: int = 50
-    """M, stochastic passes of the estimator in the loop (sec. 4)"""
-    warm_start: bool = False
-    """aid: the RL methods, end_to_end included, start from pi_priv's weights, new inputs at zero"""
-    privileged_critic: bool = False
-    """aid: the value net of the RL methods reads the true state too (Pinto et al. 2018); the policy does not"""
-    bc_sequences: int = 100
-    """behaviour cloning: trajectories per mini-batch (tab. estimator_hyperparameters)"""
-    bc_epochs: int = 110
-    """behaviour cloning: passes over the teacher set (tab. estimator_hyperparameters)"""
-    bc_lr: float = 1e-3
-    """behaviour cloning: Adam's learning rate (tab. estimator_hyperparameters)"""
-    bc_lr_end: float | None = None
-    """behaviour cloning: learning rate at the end of a cosine; none: it stays, as the paper's"""
-    bc_validation: int = 150_000
-    """behaviour cloning: most trajectories of a validation (appendix B.3)"""
+class Reinforced(ppo.Hyperparameters):
+    """What the RL methods read."""
+
+    passes: int = 50  # M, stochastic passes of the estimator in the loop (sec. 4)
+    warm_start: bool = False  # the RL methods, end_to_end included, start from pi_priv's weights, new inputs at zero
+    privileged_critic: bool = False  # RL: the value net reads the true state too (Pinto et al. 2018)
 
 
-_QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy=0.0005, kl_target=0.015,
+@dataclass
+class Cloned:
+    """What behaviour cloning reads, beside sizes and grad_norm."""
+
+    bc_sequences: int = 100  # behaviour cloning: trajectories per mini-batch (tab. estimator_hyperparameters)
+    bc_epochs: int = 110  # behaviour cloning: passes over the teacher set (tab. estimator_hyperparameters)
+    bc_lr: float = 1e-3  # behaviour cloning: Adam's learning rate (tab. estimator_hyperparameters)
+    bc_lr_end: float | None = None  # behaviour cloning: learning rate at the end of a cosine; none: it stays, as the paper's
+    bc_validation: int = 150_000  # behaviour cloning: most trajectories of a validation (appendix B.3)
+
+
+@dataclass
+class Config(Cloned, Reinforced, command.Reader):
+    method: Literal[(*METHODS, "all")] = "all"  # which policy to train
+
+
+_QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy_coef=0.0005, kl_target=0.015,
               kl_target_end=0.003, lr=3e-4, lr_min=2e-5, lr_max=2e-3, warm_start=True, privileged_critic=True,
               bc_lr=2e-3, bc_lr_end=5e-5)
 PRESETS = {
@@ -52,56 +56,68 @@ PRESETS = {
 }
 
 
-def inputs_of(cfg):
-    """Paths of what a method reads; UserError where it does not fit."""
-    def nets(*names):
-        return {name: artifacts.find(cfg, "01_train_privileged", f"{name}.safetensors") for name in names}
+def settings_of(cfg):
+    """Names of the settings that a method reads."""
+    if METHODS[cfg.method].training == "cloning":
+        return {"method", "sizes", "grad_norm", *(field.name for field in fields(Cloned))}
+    reads = {"method", *(field.name for field in fields(Reinforced))}
+    return reads if METHODS[cfg.method].estimator else reads - {"passes"}
 
-    if cfg.method == "behavior_cloning":
+
+def inputs_of(cfg):
+    """Paths of what a method reads.
+
+    Raises UserError: something is missing, or does not fit.
+    """
+    def nets(*names):
+        return {name: runs.find(cfg, "01_train_privileged", f"{name}.safetensors") for name in names}
+
+    if METHODS[cfg.method].training == "cloning":
         train, validation = (trajectories.load_set(cfg, f"teacher_{name}")[1] for name in ("train", "validation"))
         return nets("policy") | train | validation
     paths = nets("policy", "value") if cfg.warm_start else {}
-    if cfg.warm_start and (sizes := tuple(networks.load_recurrent(paths["policy"]).sizes)) != cfg.sizes:
-        raise artifacts.UserError(f"--sizes {cfg.sizes}: pi_priv has {sizes}; use those, or --no-warm-start")
-    if kind := stacks.ESTIMATOR[cfg.method]:
-        paths["estimator"] = artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", kind)
+    if cfg.warm_start and (sizes := weights.load(networks.Recurrent, paths["policy"]).sizes) != cfg.sizes:
+        raise UserError(f"--sizes {cfg.sizes}: pi_priv has {sizes}; use those, or --no-warm-start")
+    if kind := METHODS[cfg.method].estimator:
+        paths["estimator"] = runs.find(cfg, "03_train_estimator", "estimator.safetensors", kind)
     return paths
 
 
 def start_from(net, trained, first=0):
     """Copies pi_priv's (or its value net's) weights into a net with its inputs from `first` on; others get zero weights."""
-    weights = trained.state_dict()
+    trained_weights = trained.state_dict()
     wide = torch.zeros_like(net.encoder.weight)
-    wide[:, first:first + trained.inputs] = weights["encoder.weight"]
-    net.load_state_dict(weights | {"encoder.weight": wide})
+    wide[:, first:first + trained.inputs] = trained_weights["encoder.weight"]
+    net.load_state_dict(trained_weights | {"encoder.weight": wide})
 
 
 def train_rl(run, cfg, paths, device):
     """Recurrent PPO on the method's stack (sec. 3.3). Returns the policy, None when the time limit stopped it."""
-    estimator = networks.load_estimator(paths["estimator"], device) if "estimator" in paths else None
-    env = stacks.make(cfg.method, cfg.num_envs, estimator, cfg.passes, privileged=cfg.privileged_critic)
-    held_out = stacks.make(cfg.method, cfg.eval_episodes, estimator, cfg.passes)
+    method = METHODS[cfg.method]
+    estimator = weights.load(networks.Estimator, paths["estimator"], device) if method.estimator else None
+    env = stacks.make(method, cfg.num_envs, estimator, cfg.passes, privileged=cfg.privileged_critic)
+    held_out = stacks.make(method, cfg.eval_episodes, estimator, cfg.passes)
     torch.manual_seed(cfg.seed)
-    seen, known = (e.single_observation_space.shape[0] for e in (held_out, env))
-    pi, critic = networks.policy(seen, cfg.sizes).to(device), networks.value(known, cfg.sizes).to(device)
+    known = env.single_observation_space.shape[0]
+    pi, critic = networks.policy(method.size, cfg.sizes).to(device), networks.value(known, cfg.sizes).to(device)
     if cfg.warm_start:
-        start_from(pi, networks.load_recurrent(paths["policy"], device))
-        start_from(critic, networks.load_recurrent(paths["value"], device), seen if cfg.privileged_critic else 0)
-    return pi if ppo.train(run, cfg, env, held_out, pi, critic) else None
+        start_from(pi, weights.load(networks.Recurrent, paths["policy"], device))
+        start_from(critic, weights.load(networks.Recurrent, paths["value"], device), method.size if cfg.privileged_critic else 0)
+    return pi if training.train(run, cfg, env, held_out, pi, critic) else None
 
 
 def train_bc(run, cfg, paths, device):
     """Behaviour cloning of pi_priv on its own trajectories (appendix B.3): the student of the lowest validation loss."""
-    teacher = networks.load_recurrent(paths["policy"], device)
+    teacher = weights.load(networks.Recurrent, paths["policy"], device)
     torch.manual_seed(cfg.seed)
-    student = networks.policy(9, cfg.sizes).to(device)
+    student = networks.policy(METHODS[cfg.method].size, cfg.sizes).to(device)
 
     def loss(o, s, mask, generator):
         """Sum over both velocities of the cross-entropy with the teacher's distribution."""
         off = symmetry.signs(s[0].cpu().numpy())  # the teacher acted in the frame of the true start
         s_teacher = torch.as_tensor(symmetry.mirror(s.cpu().numpy(), off), device=device)
         flipped = torch.as_tensor(off < 0, device=device)[None, :, :, None]
-        with networks.autocast(device):
+        with speed.autocast(device):
             with torch.no_grad():
                 target = networks.log_softmax(teacher(s_teacher)[0]).exp()
             target = torch.where(flipped, target.flip(-1), target)
@@ -109,34 +125,35 @@ def train_bc(run, cfg, paths, device):
         return (-(target * logp).sum((-1, -2)) * mask).sum() / mask.sum()
 
     done = supervised.fit(
-        run, student, loss, lambda: networks.save_recurrent(run.dir / "policy.safetensors", student),
+        run, student, loss, lambda: weights.save(run.dir / "policy.safetensors", student),
         trajectories.load_set(cfg, "teacher_train")[0], trajectories.load_set(cfg, "teacher_validation")[0],
         seed=cfg.seed, sequences=cfg.bc_sequences, epochs=cfg.bc_epochs, lr=cfg.bc_lr, lr_end=cfg.bc_lr_end,
         grad_norm=cfg.grad_norm, validation=cfg.bc_validation)
-    return networks.load_recurrent(run.dir / "policy.safetensors", device) if done else None
+    return weights.load(networks.Recurrent, run.dir / "policy.safetensors", device) if done else None
 
 
 def main(cfg):
-    device = artifacts.device_of(cfg)
+    device = command.device_of(cfg)
     for method in METHODS if cfg.method == "all" else [cfg.method]:
-        cfg = replace(cfg, method=method)
+        cfg, cloning = replace(cfg, method=method), METHODS[method].training == "cloning"
         paths = inputs_of(cfg)
-        run = artifacts.Run(cfg, "04_train_policy", paths, method)
+        run = runs.Run(cfg, "04_train_policy", paths, method, settings_of(cfg))
         if run.skip():
             continue
-        pi = (train_bc if method == "behavior_cloning" else train_rl)(run, cfg, paths, device)
+        pi = (train_bc if cloning else train_rl)(run, cfg, paths, device)
         if pi is None:
             return
-        networks.save_recurrent(run.dir / "policy.safetensors", pi)
-        if method == "behavior_cloning":
-            plots.validation_loss(cfg.own, "bc_loss", run.dir / "bc_loss.png")
+        weights.save(run.dir / "policy.safetensors", pi)
+        if cloning:
+            plots.validation_loss(cfg.roots, "bc_loss", run.dir / "bc_loss.png")
             run.finish(["policy.safetensors"], **supervised.outcome(run))
             print(f"{run.dir}: validation loss {run.record['validation_loss']:.4f}")
         else:
-            plots.success_rate(cfg.own, run.dir / "success_rate.png")
-            run.finish(["policy.safetensors"], **ppo.outcome(run))
+            plots.training(run.rows(), run.dir / "training.png")
+            plots.success_rate(cfg.roots, run.dir / "success_rate.png")
+            run.finish(["policy.safetensors"], **training.outcome(run))
             print(f"{run.dir}: succeeds in {run.record['success']:.1%} of held-out episodes")
 
 
 if __name__ == "__main__":
-    artifacts.main(Config, PRESETS, main, __doc__)
+    command.main(Config, PRESETS, main, __doc__)

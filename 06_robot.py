@@ -3,10 +3,9 @@
     python 06_robot.py [pretrained|smoke|quick|laptop|paper] [--weights DIR] [--scenario natural|hand_5s|hand_full|all]
         [--runs n] [--video] [--seed k] [--realtime] [--arm module:Class] [--camera source] [--print-tags]
 
-Reads est_uncertainty (04) and the estimator ours (03): of the same preset, or in the folder --weights, which is pretrained/
-with the preset pretrained. Writes runs/<preset>/06_robot/seed<k>/: summary.json, robot.png, a log <scenario>_<run>.npz a run
-and, with --video, two mp4 a run: the three views, and the camera alone. A rerun goes on with the next run. With --print-tags
-it only writes <out>/tags.pdf, the sheet for the box.
+Reads est_uncertainty (04) and the estimator ours (03), of the same preset or in the folder --weights. Writes to
+runs/<preset>/06_robot/seed<k>/: summary.json, robot.png, a log <scenario>_<run>.npz a run and, with --video, two mp4 a run:
+the three views, and the camera alone. A rerun goes on with the next run. --print-tags only writes <out>/tags.pdf.
 """
 import importlib
 import signal
@@ -19,8 +18,10 @@ import cv2
 import numpy as np
 import torch
 
-from common import artifacts, belief, networks, observation, plots, symmetry, tables, task
+from common import belief, command, networks, observation, plots, runs, speed, statistics, symmetry, tables, task, weights
 from common.env import PushVectorEnv
+from common.files import UserError, save_json, write_atomic
+from common.progress import bar
 from common.robot import hardware, iiwa, ik, runlog, safety, scene, tags, views
 
 SCENARIOS = ("natural", "hand_5s", "hand_full")
@@ -30,24 +31,16 @@ CERTAIN = 5  # ticks that the estimate must stay in the tolerance, where nobody 
 
 
 @dataclass
-class Config(hardware.Gaps, artifacts.Reader):
-    scenario: Literal["natural", "hand_5s", "hand_full", "all"] = "all"
-    """occlusions: natural ones only; and a hand over the tags from a moment within 1 to 5 s, for 5 s or to the end (sec. 6)"""
-    runs: int = 20
-    """runs of each scenario (the paper: 20, 10, 10)"""
-    passes: int = 50
-    """M, stochastic passes of the estimator (sec. 4)"""
-    video: bool = False
-    """write the views and the camera's images of every run as mp4"""
-    realtime: bool = False
-    """let the simulated arm move as fast as a real one, not as fast as it can"""
-    arm: str = "simulated"
-    """module:Class of a real one, with the methods of hardware.Arm; it is given this config"""
-    camera: str = ""
-    """device number, file or address of a camera that OpenCV opens, instead of the arm's own"""
-    print_tags: bool = False
-    """write the sheet of tags for the box, and nothing else"""
-    free: ClassVar = (*artifacts.Reader.free, "scenario", "runs", "video", "realtime", "print_tags")
+class Config(hardware.Gaps, command.Reader):
+    scenario: Literal["natural", "hand_5s", "hand_full", "all"] = "all"  # plus a hand over the tags for 5 s, or to the end
+    runs: int = 20  # runs of each scenario (the paper: 20, 10, 10)
+    passes: int = 50  # M, stochastic passes of the estimator (sec. 4)
+    video: bool = False  # write the views and the camera's images of every run as mp4
+    realtime: bool = False  # let the simulated arm move as fast as a real one, not as fast as it can
+    arm: str = "simulated"  # module:Class of a real one, with the methods of hardware.Arm; it is given this config
+    camera: str = ""  # device number, file or address of a camera that OpenCV opens, instead of the arm's own
+    print_tags: bool = False  # write the sheet of tags for the box, and nothing else
+    free: ClassVar = (*command.Reader.free, "scenario", "runs", "video", "realtime", "print_tags")
 
 
 PRESETS = {
@@ -60,37 +53,31 @@ PRESETS = {
 
 
 def connect(cfg):
-    """The arm behind its guard.
-
-    Raises:
-        artifacts.UserError: no such class or camera, or a gap below zero.
-    """
+    """The arm behind its guard; UserError where there is no such class or camera, or a gap is below zero."""
     for name in vars(hardware.Gaps()):
         if not 0 <= getattr(cfg, name) < np.inf:
-            raise artifacts.UserError(f"--{name.replace('_', '-')} {getattr(cfg, name)}: at least 0, and finite")
+            raise UserError(f"--{name.replace('_', '-')} {getattr(cfg, name)}: at least 0, and finite")
     module, _, name = cfg.arm.partition(":")
     try:  # whatever goes wrong in somebody's class
         arm = (hardware.SimulatedArm if cfg.arm == "simulated" else getattr(importlib.import_module(module), name))(cfg)
     except Exception as error:
-        message = f"--arm {cfg.arm}: {type(error).__name__}: {error}; say simulated, or module:Class"
-        raise artifacts.UserError(message) from None
-    if not cfg.camera:
-        return safety.Guarded(arm)
+        raise UserError(f"--arm {cfg.arm}: {type(error).__name__}: {error}; say simulated, or module:Class") from None
     clock = (lambda: arm.time) if isinstance(arm, hardware.SimulatedArm) else time.monotonic
-    return safety.Guarded(arm, hardware.VideoCamera(cfg.camera, clock, cfg.latency / task.RATE).grab)
+    camera = hardware.VideoCamera(cfg.camera, clock, cfg.latency / task.RATE) if cfg.camera else arm
+    return safety.Guarded(arm, camera.grab)
 
 
-def prepare(arm, cfg, scenario, run):
-    """Box, look-pose and hand of a run. Returns from when to when the hand covers the tags, in s."""
-    rng = np.random.default_rng([cfg.seed, SCENARIOS.index(scenario), run, 4])
+def prepare(arm, cfg, scenario, k):
+    """Box and look-pose of run k of a scenario. Returns from when to when a hand covers the tags, in s."""
+    rng = np.random.default_rng([cfg.seed, SCENARIOS.index(scenario), k, 4])
     torch.manual_seed(int(rng.integers(2**62)))  # of the dropout masks
     start = rng.uniform(1, 5)
     hand = {"natural": (np.inf, np.inf), "hand_5s": (start, start + 5), "hand_full": (start, np.inf)}[scenario]
     if not isinstance(arm, hardware.SimulatedArm):
         try:
-            input(f"{scenario}, run {run + 1}: place the box, bring the pusher to where the camera sees it, and press Enter ")
+            input(f"{scenario}, run {k + 1}: place the box, bring the pusher to where the camera sees it, and press Enter ")
         except EOFError:
-            raise artifacts.UserError("a real arm needs someone at the terminal, to place the box") from None
+            raise UserError("a real arm needs someone at the terminal, to place the box") from None
         return hand
     world = PushVectorEnv(1)
     while True:  # a start of the study from which the camera sees the box
@@ -102,23 +89,21 @@ def prepare(arm, cfg, scenario, run):
 
 def sense(arm, tracker):
     """grab -> track. The first columns of a tick's row: see runlog.log_of."""
-    taken, image = arm.grab()
-    now, q = arm.read_joints()
-    sight = tracker.update(image, scene.wrist_camera(*iiwa.chain(arm.joints_then(taken))[1:]))
+    (taken, image), (now, q) = arm.grab(), arm.read_joints()
     _, points, rotation = iiwa.chain(q)
+    sight = tracker.update(image, scene.wrist_camera(*iiwa.chain(arm.joints_then(taken))[1:]))
     return dict(time=now, joints=q, pusher=points[7, :2], force=(rotation @ arm.force)[:2], image=image, **vars(sight))
 
 
 def think(f, pi, passes, row, memory):
-    """believe -> act, in the mirrored frame in which the nets have learned; `memory` is None at a run's start.
+    """believe -> act, in the mirrored frame in which the nets have learned.
 
-    Returns:
-        belief (12,) and action (2,) in the workspace's frame, and the next memory.
+    Returns belief (12,) and action (2,) in the workspace's frame, and the next memory; `memory` is None at a run's start.
     """
     o = observation.assemble(np.concatenate([row["seen"], row["pusher"], row["force"]])[None], np.array([row["age"] > 0]))
     sign, hidden, recall = memory or (symmetry.signs(o), None, None)
     s_hat, hidden = belief.believe(f, symmetry.mirror(o, sign), hidden, passes)
-    with torch.no_grad(), networks.autocast("cpu"):
+    with torch.no_grad(), speed.autocast("cpu"):
         logits, recall = pi(torch.as_tensor(s_hat)[None], recall)
     action = symmetry.mirror_action(networks.mode(logits[0]).numpy(), sign)
     return symmetry.mirror(s_hat, sign)[0], action[0], (sign, hidden, recall)
@@ -126,8 +111,7 @@ def think(f, pi, passes, row, memory):
 
 def drive(arm, velocity, wait):
     """QP -> command: moves the pusher with (2,) m/s for one tick; returns how many of its programs were not solved."""
-    _, q = arm.read_joints()
-    unsolved = 0
+    unsolved, q = 0, arm.read_joints()[1]
     for _ in range(STEPS):
         speeds = ik.solve(q, velocity)
         unsolved += speeds is None
@@ -138,12 +122,10 @@ def drive(arm, velocity, wait):
     return unsolved
 
 
-def play(arm, f, pi, cfg, hand, rows):
+def control(arm, f, pi, cfg, hand, rows):
     """One run: grab -> track -> believe -> act -> QP -> command, 15 times a second. Returns how it ended.
 
-    Args:
-        arm: safety.Guarded; f, pi: estimator and policy; hand: (from, to) in s, to tell who covers the tags of a real arm.
-        rows: list that gets a dict a tick.
+    `hand` (from, to) in s is for who covers the tags of a real arm; `rows` is a list that gets a dict a tick.
     """
     simulated = isinstance(arm.arm, hardware.SimulatedArm)
     cues = {int(moment * task.RATE): f"now {word} the tags" for moment, word in zip(hand, ("cover", "uncover")) if moment < 60}
@@ -168,7 +150,6 @@ def play(arm, f, pi, cfg, hand, rows):
         row["unsolved"] = drive(arm, task.SPEEDS[action], wait)
         row["busy"] = time.perf_counter() - began - (wait.slept - slept)
         rows.append(row)
-
         box, pusher = arm.arm.box if simulated else row["estimated"], iiwa.chain(arm.read_joints()[1])[1][7, :2]
         certain = certain + 1 if task.reached(box) else 0
         if certain >= (1 if simulated else CERTAIN):
@@ -178,30 +159,26 @@ def play(arm, f, pi, cfg, hand, rows):
     return "out of time"
 
 
-def perform(arm, f, pi, cfg, run, logs, scenario, k):
-    """Run k of a scenario with all that is kept of it: film, figure, and last its log, by which a rerun knows it.
-
-    Raises:
-        safety.Stop: the arm has been stopped; the run is logged as "stopped", if it was not Ctrl-C on a simulated arm.
-    """
+def perform(arm, f, pi, run, logs, scenario, k):
+    """Run k of a scenario, its film and figure, and last its log, by which a rerun knows it; Stop where the arm was stopped."""
     rows, stop, name = [], None, f"{scenario}_{k:03d}"
-    hand = prepare(arm.arm, cfg, scenario, k)
+    hand = prepare(arm.arm, run.cfg, scenario, k)
     try:
         with arm:
-            ended = play(arm, f, pi, cfg, hand, rows)
+            ended = control(arm, f, pi, run.cfg, hand, rows)
     except safety.Stop as reason:
         if isinstance(arm.arm, hardware.SimulatedArm) and isinstance(reason.__context__, KeyboardInterrupt):
             raise  # not the policy's failure: the same command plays the run again
         ended, stop = "stopped", reason
     log = runlog.log_of(rows, ended)
-    if rows and cfg.video:
+    if rows and run.cfg.video:
         views.write(rows, run.dir / f"{name}.mp4", run.dir / f"{name}_camera.mp4")
     others = [runlog.worth(other) for done in logs.values() for other in done.values() if "age" in other]
     if rows and runlog.worth(log) > max(others, default=()):
         plots.robot(views.columns(rows), f"{scenario}, run {k + 1}: {ended}", run.dir / "robot.png")
-    artifacts.write_atomic(run.dir / f"{name}.npz", lambda temporary: np.savez(temporary, **log))
+    write_atomic(run.dir / f"{name}.npz", lambda temporary: np.savez(temporary, **log))
     logs[scenario][k] = log
-    artifacts.save_json(run.dir / "summary.json", tables.robot_runs(logs))
+    save_json(run.dir / "summary.json", statistics.robot_runs(logs))
     if stop:
         raise stop
     if not rows:
@@ -214,37 +191,36 @@ def main(cfg):
         tags.print_sheet(cfg.out / "tags.pdf")
         return print(f"{cfg.out / 'tags.pdf'}: print it at 100 %, and measure the ruler")
     cv2.setNumThreads(1)  # images are small, and threads wait for each other
-    paths = {"estimator": artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", "ours"),
-             "policy": artifacts.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty")}
-    f, pi = networks.load_estimator(paths["estimator"]), networks.load_recurrent(paths["policy"])
-    folder = artifacts.run_folder(cfg.own, "06_robot", None, cfg.seed)
-    others = [scenario for scenario in SCENARIOS if cfg.scenario not in ("all", scenario)]
-    if cfg.force and any(runlog.read(folder, scenario) for scenario in others):
-        raise artifacts.UserError(f"--force redoes all scenarios of {folder}: say --scenario all, or another --seed")
+    paths = {"estimator": runs.find(cfg, "03_train_estimator", "estimator.safetensors", "ours"),
+             "policy": runs.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty")}
+    f, pi = weights.load(networks.Estimator, paths["estimator"]), weights.load(networks.Recurrent, paths["policy"])
+    folder = runs.run_folder(cfg.own, "06_robot", None, cfg.seed)
+    scenarios = SCENARIOS if cfg.scenario == "all" else (cfg.scenario,)
+    if cfg.force and any(runlog.read(folder, other) for other in SCENARIOS if other not in scenarios):
+        raise UserError(f"--force redoes all scenarios of {folder}: say --scenario all, or another --seed")
     arm = connect(cfg)
-    run = artifacts.Run(cfg, "06_robot", paths)
+    run = runs.Run(cfg, "06_robot", paths)
     logs = {scenario: runlog.read(run.dir, scenario) for scenario in SCENARIOS}
-    todo = [(scenario, k) for scenario in (SCENARIOS if cfg.scenario == "all" else [cfg.scenario]) for k in range(cfg.runs)
-            if k not in logs[scenario]]
+    todo = [(scenario, k) for scenario in scenarios for k in range(cfg.runs) if k not in logs[scenario]]
     if run.finished and not todo:
-        print(f"{tables.robot(tables.robot_runs(logs))}\n")
+        print(f"{tables.robot(statistics.robot_runs(logs))}\n")
         return run.skip()
-    bar = artifacts.bar(len(todo), "06_robot", unit="run")
+    progress = bar(len(todo), "06_robot", unit="run")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # which stops the arm as Ctrl-C does
     try:
         for scenario, k in todo:
-            bar.set_postfix_str(perform(arm, f, pi, cfg, run, logs, scenario, k), refresh=False)
-            bar.update()
+            progress.set_postfix_str(perform(arm, f, pi, run, logs, scenario, k), refresh=False)
+            progress.update()
             if run.out_of_time():
                 return run.stop()
     finally:
         arm.stop()
-    bar.close()
-    summary = tables.robot_runs(logs)
-    artifacts.save_json(run.dir / "summary.json", summary)  # a kill may have come between the last log and its summary
+    progress.close()
+    summary = statistics.robot_runs(logs)
+    save_json(run.dir / "summary.json", summary)  # a kill may have come between the last log and its summary
     print(f"\n{tables.robot(summary)}\n\nfigure, logs and summary.json: {run.dir}")
     run.finish(["summary.json"])
 
 
 if __name__ == "__main__":
-    artifacts.main(Config, PRESETS, main, __doc__)
+    command.main(Config, PRESETS, main, __doc__)

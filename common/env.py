@@ -24,14 +24,13 @@ class PushVectorEnv(gym.vector.VectorEnv):
     is set, `final_obs` (N, 8) and `final_state` (N, 7) hold its end, and observation and `state` start the next episode.
 
     Args:
-        num_envs: number of worlds.
         whole_workspace: draw the starts over the whole workspace instead of the study's region.
         sub_steps: physics steps a control step.
 
     Attributes:
         worlds: simulator.Worlds, the physics; its box, pusher, force, dynamics (here the drawn ones) and state are here too.
-        tolerance, near_share: aids to training (1 and 0 are none): the factor on the success tolerance, and the share of
-        episodes that start with the box at a random fraction of its way from the target and the pusher beside it.
+        tolerance, near_share: a curriculum's (training.py; 1 and 0 are none): the factor on the success tolerance, and the
+        share of episodes that start with the box at a random fraction of its way from the target and the pusher beside it.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
@@ -47,46 +46,25 @@ class PushVectorEnv(gym.vector.VectorEnv):
         self.worlds = Worlds(num_envs, sub_steps)
         self._steps = np.zeros(num_envs, int)
 
-    @property
-    def box(self):
-        return self.worlds.box
-
-    @property
-    def pusher(self):
-        return self.worlds.pusher
-
-    @property
-    def force(self):
-        return self.worlds.force
-
-    @property
-    def dynamics(self):
-        return self.worlds.dynamics
-
-    @property
-    def state(self):
-        return self.worlds.state
+    box, pusher, force, dynamics, state = (
+        property(lambda self, name=name: getattr(self.worlds, name)) for name in ("box", "pusher", "force", "dynamics", "state"))
 
     def _draw_start(self, count, box=None, pusher=None):
         """Starts of the study around what is given; the aided ones: box nearer to the target, pusher within 3 cm of it."""
         rng = self.np_random
-
-        def draw_box(k):
-            return rng.uniform(-1, 1, (k, 3)) * [*self._start_box, np.pi]
-
-        def draw_pusher(k):
-            return rng.uniform(-1, 1, (k, 2)) * task.HALF
-
+        box_range = [*self._start_box, np.pi]
         near = rng.random(count) < self.near_share
-        boxes = draw_box(count) * np.where(near, rng.random(count), 1.0)[:, None] if box is None else box
-        pushers = draw_pusher(count) if pusher is None else pusher
+        boxes = box
+        if box is None:
+            boxes = rng.uniform(-1, 1, (count, 3)) * box_range * np.where(near, rng.random(count), 1.0)[:, None]
+        pushers = rng.uniform(-1, 1, (count, 2)) * task.HALF if pusher is None else pusher
         farthest = np.where(near & (pusher is None), 0.03, np.inf)
         for i in range(count if box is None or pusher is None else 0):
             while not task.START_GAP <= geometry.nearest(boxes[i], pushers[i])[0] <= farthest[i]:
                 if pusher is None:
-                    pushers[i] = draw_pusher(1)
+                    pushers[i] = rng.uniform(-1, 1, 2) * task.HALF
                 else:
-                    boxes[i] = draw_box(1)
+                    boxes[i] = rng.uniform(-1, 1, 3) * box_range
         return boxes, pushers
 
     def _start(self, worlds, **given):
@@ -97,12 +75,11 @@ class PushVectorEnv(gym.vector.VectorEnv):
 
     def _given(self, options):
         """Reset options as arrays (N, ...), checked: Chipmunk would end the process at a negative coefficient."""
-        given = {}
+        given, shapes = {}, {"box": (3,), "pusher": (2,)} | dict.fromkeys(_DRAWS, ())
         for name, value in (options or {}).items():
-            if name not in ("box", "pusher", *_DRAWS):
-                raise ValueError(f"unknown reset option {name!r}; known: box, pusher, {', '.join(_DRAWS)}")
-            one = {"box": (3,), "pusher": (2,)}.get(name, ())
-            value = np.asarray(value, float)
+            if name not in shapes:
+                raise ValueError(f"unknown reset option {name!r}; known: {', '.join(shapes)}")
+            one, value = shapes[name], np.asarray(value, float)
             if value.shape not in (one, (self.num_envs, *one)):
                 raise ValueError(f"reset option {name!r} has shape {value.shape}, not {(self.num_envs, *one)} or {one}")
             if not np.isfinite(value).all() or name in _DRAWS and value.min() < 0 or name == "mass" and value.min() == 0:
@@ -113,8 +90,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
     def reset(self, *, seed=None, options=None):
         """Starts every world anew; `options` gives any of box (N, 3), pusher (N, 2) and the dynamics (N,), or one for all.
 
-        Raises:
-            ValueError: an unknown option, or one of a wrong shape or value.
+        Raises ValueError: an unknown option, or one of a wrong shape or value.
         """
         super().reset(seed=seed)
         self._start(np.arange(self.num_envs), **self._given(options))
@@ -178,36 +154,8 @@ class PushEnv(gym.Env):
         return obs, float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(success[0])
 
     def render(self):
-        return draw(self.vector.state[0])
-
-
-VIEW = 1.1 * task.WORKSPACE[0]  # m, the width of draw's picture
-SQUARE = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
-
-
-def corners(pose):
-    """Corners (4, 2) of the box at a pose (3,), m."""
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    return SQUARE * task.BOX[:2] / 2 @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
-
-
-def draw(state, width=800):
-    """Top view (width / 2, width, 3) uint8 of a state (7,): target light blue, box dark blue, pusher red (fig. sim)."""
-    import cv2  # only pictures need it
-    image = np.full((width // 2, width, 3), 255, np.uint8)
-
-    def pixels(points):  # m to 1/16 pixel
-        points = np.atleast_2d(points) * [1, -1] * width / VIEW + [width / 2, width / 4]
-        return np.round(points * 16).astype(np.int32)
-
-    cv2.polylines(image, [pixels(SQUARE * task.HALF)], True, (150, 150, 150), 2, cv2.LINE_AA, 4)
-    cv2.fillPoly(image, [pixels(corners(np.zeros(3)))], (170, 205, 240), cv2.LINE_AA, 4)
-    cv2.fillPoly(image, [pixels(corners(state[:3]))], (30, 60, 130), cv2.LINE_AA, 4)
-    front = state[:2] + np.array([np.cos(state[2]), np.sin(state[2])]) * task.BOX[0] / 2
-    cv2.line(image, pixels(state[:2])[0].tolist(), pixels(front)[0].tolist(), (255, 255, 255), 2, cv2.LINE_AA, 4)
-    radius = int(task.RADIUS * width / VIEW * 16)
-    cv2.circle(image, pixels(state[3:5])[0].tolist(), radius, (210, 40, 40), -1, cv2.LINE_AA, 4)
-    return image
+        from common import draw  # only pictures need OpenCV
+        return draw.top_view(self.vector.state[0])
 
 
 gym.register("Push-v0", entry_point="common.env:PushEnv", vector_entry_point="common.env:PushVectorEnv")

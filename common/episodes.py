@@ -3,27 +3,22 @@ import numpy as np
 import torch
 
 from common import task
-from common.networks import autocast, mode, sample
+from common.networks import mode, sample
+from common.speed import autocast
 
 
 @torch.no_grad()
 def play(env, actor, seed, greedy=True, record=None):
-    """Plays one whole episode in every world: the first after `reset(seed)`.
+    """Success (N,) bool and length (N,) in steps of one whole episode in every world: the first after `reset(seed)`.
 
-    Args:
-        actor: policy net on the env's observations.
-        greedy: the mode of each categorical, else a sample.
-        record: called as record(t, obs, env, running) before each action.
-    Returns:
-        success (N,) bool and length (N,) in steps.
+    Actions are the mode of each categorical if greedy, else a sample; record(t, env) is called before each.
     """
     device = next(actor.parameters()).device
     obs, _ = env.reset(seed=seed)
-    running, success = np.ones(len(obs), bool), np.zeros(len(obs), bool)
-    length, hidden = np.zeros(len(obs), int), None
+    running, success, length, hidden = np.ones(len(obs), bool), np.zeros(len(obs), bool), np.zeros(len(obs), int), None
     for t in range(task.HORIZON):
         if record:
-            record(t, obs, env, running)
+            record(t, env)
         with autocast(device):
             logits, hidden = actor(torch.as_tensor(obs, device=device)[None], hidden)
         action = (mode if greedy else sample)(logits[0])

@@ -1,38 +1,28 @@
 """Recorded episodes, with what the policy's stack saw and believed, and a film of one (mp4 and GIF)."""
 import cv2
-import gymnasium as gym
 import numpy as np
 from PIL import Image
 
-from common import env, symmetry, task
-from common.artifacts import UserError, write_atomic
-from common.env import VIEW, corners
+from common import draw, symmetry, task
+from common.files import UserError, write_atomic
+from common.wrappers import EpisodeWrapper, state_of
 
-WIDTH, HEIGHT = 960, 600  # pixels: the top view of env.draw, and 120 rows of text below
-SCALE = WIDTH / VIEW  # pixels per m
+WIDTH, HEIGHT = 960, 600  # pixels: the top view, and 120 rows of text below
 HELD, ESTIMATE, FORCE, TEXT = (230, 159, 0), (0, 158, 115), (0, 0, 0), (60, 60, 60)  # RGB
 
 
-class Recorded(gym.vector.VectorWrapper):
-    """The topmost wrapper of a stack: keeps what its infos told since `reset`, ends of episodes included.
-
-    Attribute `rows`: one dict a step of `state` (N, 7) and, where the stack has them, `o` (N, 9) and `belief` (N, 12).
-    """
+class Recorded(EpisodeWrapper):
+    """The topmost wrapper of a stack: `rows` of each step's `state` (N, 7) and, if there are, `o` (N, 9), `belief` (N, 12)."""
 
     def reset(self, *, seed=None, options=None):
-        obs, infos = self.env.reset(seed=seed, options=options)
         self.rows = []
-        self._keep(infos)
-        return obs, infos
+        obs, infos = super().reset(seed=seed, options=options)
+        return self.observe(obs, infos), infos
 
-    def step(self, action):
-        obs, *rest, infos = self.env.step(action)
-        self._keep(infos)
-        return obs, *rest, infos
-
-    def _keep(self, infos):
-        row = {"state": infos.get("final_state", infos["state"])} | {k: infos[k] for k in ("o", "belief") if k in infos}
+    def observe(self, obs, infos):
+        row = {"state": state_of(infos)} | {k: infos[k] for k in ("o", "belief") if k in infos}
         self.rows.append({name: x.astype(np.float32) for name, x in row.items()})
+        return obs
 
     def episode(self, world, length):
         """Arrays (length + 1, ...) of a world's first episode, its last state included, in the frame of the world."""
@@ -42,30 +32,22 @@ class Recorded(gym.vector.VectorWrapper):
         return kept
 
 
-def pixels(points):
-    """Points (..., 2) in m as integer 1/16 pixels of env.draw."""
-    return np.round(16 * (np.asarray(points) * [SCALE, -SCALE] + [WIDTH / 2, WIDTH / 4])).astype(np.int32)
-
-
 def frame(state, o, belief, step):
     """Image (HEIGHT, WIDTH, 3) uint8 RGB of a state (7,), what was seen of it (9,) and what was believed (12,)."""
-    image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
-    image[:WIDTH // 2] = env.draw(state, WIDTH)
+    image = np.vstack([draw.top_view(state, WIDTH), np.full((HEIGHT - WIDTH // 2, WIDTH, 3), 255, np.uint8)])
     held, q_hat, occluded = task.unscale_pose(o[:4]), task.unscale_pose(belief[:4]), o[8] > 0
     force, deviation = o[6:8] * task.MAX_FORCE, 2 * belief[8:10] * task.HALF
-    for pose, colour in ((held, HELD), (q_hat, ESTIMATE)):
-        cv2.polylines(image, [pixels(corners(pose))], True, colour, 3, cv2.LINE_AA, 4)
-        side = pose[:2] + np.array([np.cos(pose[2]), np.sin(pose[2])]) * task.BOX[0] / 2
-        cv2.line(image, *pixels([pose[:2], side]).tolist(), colour, 3, cv2.LINE_AA, 4)
-    axes = np.maximum(np.round(16 * SCALE * deviation), 32).astype(int).tolist()
-    cv2.ellipse(image, pixels(q_hat[:2]).tolist(), axes, 0, 0, 360, ESTIMATE, 3, cv2.LINE_AA, 4)
-    arrow = pixels([state[3:5], state[3:5] + 0.008 * force]) // 16  # 8 mm a newton
+    draw.outline(image, held, HELD)
+    draw.outline(image, q_hat, ESTIMATE)
+    axes = np.maximum(np.round(16 * WIDTH / draw.VIEW * deviation), 32).astype(int).tolist()
+    cv2.ellipse(image, draw.pixels(q_hat[:2], WIDTH).tolist(), axes, 0, 0, 360, ESTIMATE, 3, cv2.LINE_AA, 4)
+    arrow = draw.pixels([state[3:5], state[3:5] + 0.008 * force], WIDTH) // 16  # 8 mm a newton
     cv2.arrowedLine(image, *arrow.tolist(), FORCE, 3, cv2.LINE_AA, tipLength=0.25)
 
-    def text(words, x, y, colour=TEXT, size=0.6):
-        cv2.putText(image, words, (x, WIDTH // 2 + y), cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+    def text(words, x, y, colour=TEXT):
+        cv2.putText(image, words, (x, WIDTH // 2 + y), cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA)
 
-    for x, words, colour in ((20, "true box", (30, 60, 130)), (240, "target", (170, 205, 240)), (460, "observed", HELD),
+    for x, words, colour in ((20, "true box", draw.BOX), (240, "target", draw.TARGET), (460, "observed", HELD),
                              (680, "estimate, 2 sigma", ESTIMATE)):
         cv2.rectangle(image, (x, WIDTH // 2 + 10), (x + 24, WIDTH // 2 + 28), colour, -1)
         text(words, x + 34, 26)
@@ -83,15 +65,11 @@ def write(episode, mp4, gif):
     """Writes an episode of Recorded as an mp4 at 15 frames a second, and as a GIF of half its width and rate."""
     frames = [frame(*row, step) for step, row in enumerate(zip(*(episode[k] for k in ("state", "o", "belief"))))]
     frames += frames[-1:] * task.RATE  # the end stands for a second
-
-    def animation(path):
-        small = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in frames[::2]]
-        palette = Image.fromarray(np.concatenate(small[::10])).quantize(128)
-        first, *rest = (Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE) for image in small)
-        first.save(path, save_all=True, append_images=rest, duration=2000 / task.RATE, loop=0)
-
     write_mp4(mp4, frames)
-    write_atomic(gif, animation)
+    small = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in frames[::2]]
+    palette = Image.fromarray(np.concatenate(small[::10])).quantize(128)
+    first, *rest = (Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE) for image in small)
+    write_atomic(gif, lambda path: first.save(path, save_all=True, append_images=rest, duration=2000 / task.RATE, loop=0))
 
 
 def write_mp4(path, frames):
@@ -99,8 +77,7 @@ def write_mp4(path, frames):
     def video(temporary):
         writer = None
         for image in frames:
-            if writer is None:
-                writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"mp4v"), task.RATE, image.shape[1::-1])
+            writer = writer or cv2.VideoWriter(str(temporary), cv2.VideoWriter_fourcc(*"mp4v"), task.RATE, image.shape[1::-1])
             if not writer.isOpened():
                 raise UserError("this build of opencv has no mp4 encoder: install opencv-python-headless from requirements.txt")
             writer.write(image[..., ::-1])

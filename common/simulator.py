@@ -12,9 +12,9 @@ SUB_STEPS = 6  # a control step; tests/test_env.py holds the physics that this n
 ITERATIONS = 5
 SPACING = 10.0  # m between worlds, so that they never meet
 REST = 1e-4  # m/s: a slower box is at rest
-GYRATION = float(task.BOX[:2] @ task.BOX[:2]) / 12  # m^2, moment of inertia / mass
+GYRATION = float(task.BOX[:2] @ task.BOX[:2]) / 12  # k^2 in m^2, moment of inertia / mass
 DYNAMICS = ("mass", "mu_static", "mu_dynamic", "mu_pusher", "restitution")
-_SLOWING = np.array([1.0, task.LIMIT_SURFACE_C**2 / GYRATION])  # the share that friction takes of v and of omega
+_SLOWING = np.array([1.0, task.LIMIT_SURFACE_C**2 / GYRATION])  # (1, (c / k)^2)
 _MOTION = batch.BodyFields.POSITION | batch.BodyFields.ANGLE | batch.BodyFields.VELOCITY | batch.BodyFields.ANGULAR_VELOCITY
 _KICK = batch.BodyFields.VELOCITY | batch.BodyFields.ANGULAR_VELOCITY | batch.BodyFields.FORCE | batch.BodyFields.TORQUE
 _CONTACT = batch.ArbiterFields.TOTAL_IMPULSE | batch.ArbiterFields.POINT_A_1
@@ -29,16 +29,9 @@ class Worlds:
     """`num` worlds side by side: pushers that move as told, boxes that yield to contact and table friction.
 
     One Space for all, read and written by pymunk.batch: a step costs a few array operations, not a Python loop over worlds.
-
-    Args:
-        num: number of worlds.
-        sub_steps: physics steps a control step.
-        rate: control steps a second.
-
-    Attributes:
-        box (N, 3) in m, m, rad; pusher (N, 2) in m; force (N, 2) in N: what the pusher feels, world frame, mean over the
-        control step. dynamics: mass (kg), mu_static, mu_dynamic, mu_pusher, restitution, each (N,).
-        space, bodies: pymunk's, and its N boxes.
+    A control step takes 1 / rate s, in `sub_steps` of physics. Attributes: box (N, 3) in m, m, rad; pusher (N, 2) in m; force
+    (N, 2) in N, what the pusher feels, world frame, mean over the control step; dynamics: mass (kg), mu_static, mu_dynamic,
+    mu_pusher, restitution, each (N,); pymunk's space and bodies, the boxes.
     """
 
     def __init__(self, num, sub_steps=SUB_STEPS, rate=task.RATE):
@@ -49,7 +42,25 @@ class Worlds:
         self._static, self._dynamic = np.zeros(num), np.zeros(num)  # m/s, what friction can take of a speed in dt
         self._inertia = np.ones((num, 2))  # mass in kg, moment in kg m^2
         self._rest, self._touched, self._held = np.zeros((3, num), bool)  # at rest; pushed in the last sub-step, step
-        self._build()
+        self._side = int(np.ceil(np.sqrt(num)))
+        self._origin = SPACING * np.stack(np.divmod(np.arange(num), self._side), 1)
+        self.space = pymunk.Space()
+        self.space.iterations = ITERATIONS
+        self.space.collision_slop = 1e-4  # m; the default overlap of 0.1 is as wide as the box
+        self.space.collision_bias = 1e-6  # share of a deeper overlap that is left after 1 s
+        self.space.collision_persistence = 1  # a contact that has ended would still report its last impulse
+        self.bodies = [pymunk.Body(1.0, 1.0) for _ in range(num)]
+        pushers = [pymunk.Body(body_type=pymunk.Body.KINEMATIC) for _ in range(num)]
+        shapes = [pymunk.Poly.create_box(body, tuple(task.BOX[:2])) for body in self.bodies]
+        balls = [pymunk.Circle(pusher, task.RADIUS) for pusher in pushers]
+        for box, pusher, ball, origin in zip(self.bodies, pushers, balls, self._origin.tolist()):
+            box.position = pusher.position = origin  # so far apart that no broad phase sees neighbours
+            ball.friction = ball.elasticity = 1.0  # Chipmunk multiplies the pair's values: the box carries the drawn ones
+        self.space.add(*self.bodies, *shapes, *pushers, *balls)  # boxes, then pushers: the order of pymunk.batch's arrays
+        self._c_boxes = np.array([body._body for body in self.bodies], object)
+        self._c_shapes = np.array([shape._shape for shape in shapes], object)
+        self._kick = np.zeros((2 * num, 6))  # v_x, v_y, omega, f_x, f_y, tau
+        self._reader, self._contacts, self._writer = batch.Buffer(), batch.Buffer(), batch.Buffer()
 
     @property
     def state(self):
@@ -60,24 +71,24 @@ class Worlds:
         """Starts `worlds` (k,) anew at poses (k, 3) and (k, 2), at rest, with given dynamics ({name: (k,)})."""
         for name, value in dynamics.items():
             self.dynamics[name][worlds] = value
-        d = {name: value[worlds] for name, value in self.dynamics.items()}
-        self._inertia[worlds] = d["mass"][:, None] * [1.0, GYRATION]
-        self._static[worlds] = d["mu_static"] * task.GRAVITY * self._dt
-        self._dynamic[worlds] = d["mu_dynamic"] * task.GRAVITY * self._dt
-        _set_all(lib.cpShapeSetFriction, self._c_shapes[worlds], d["mu_pusher"])
-        _set_all(lib.cpShapeSetElasticity, self._c_shapes[worlds], d["restitution"])
+        mass, mu_static, mu_dynamic, mu_pusher, restitution = (self.dynamics[name][worlds] for name in DYNAMICS)
+        self._inertia[worlds] = mass[:, None] * [1.0, GYRATION]
+        self._static[worlds] = mu_static * task.GRAVITY * self._dt
+        self._dynamic[worlds] = mu_dynamic * task.GRAVITY * self._dt
+        _set_all(lib.cpShapeSetFriction, self._c_shapes[worlds], mu_pusher)
+        _set_all(lib.cpShapeSetElasticity, self._c_shapes[worlds], restitution)
         self._rest[worlds] = False  # so that the next sub-step sets the new mass
         self.box[worlds], self.pusher[worlds], self.force[worlds] = box, pusher, 0.0
         for i in worlds:  # nothing of the last episode stays: contacts keep their impulses, bodies a position correction
             lib.cpSpaceRemoveShape(self.space._space, self._c_shapes[i])
             lib.cpSpaceAddShape(self.space._space, self._c_shapes[i])
             lib.cpBodyUpdatePosition(self._c_boxes[i], 0.0)
-        self._motion[:] = self._read()
+        motion = self._read().copy()
         for rows, pose in (worlds, box), (self.num + worlds, pusher):
-            self._motion[rows] = 0.0
-            self._motion[rows, :pose.shape[1]] = pose
-            self._motion[rows, :2] += self._origin[worlds]
-        self._write(self._motion, _MOTION)
+            motion[rows] = 0.0
+            motion[rows, :pose.shape[1]] = pose
+            motion[rows, :2] += self._origin[worlds]
+        self._write(motion, _MOTION)
 
     def step(self, velocity):
         """Moves the pushers with `velocity` (N, 2) in m/s for one control step."""
@@ -86,10 +97,9 @@ class Worlds:
         new = np.flatnonzero(held != self._held)
         _set_all(lib.cpShapeSetElasticity, self._c_shapes[new], np.where(held, 0.0, self.dynamics["restitution"])[new])
         self._held = held
-        motion = self._read()
-        change = np.linalg.norm(velocity - motion[n:, 3:5], axis=1)
         self._kick[n:, :2] = velocity
-        impulse = np.zeros((n, 2))
+        motion, impulse = self._read(), np.zeros((n, 2))
+        change = np.linalg.norm(velocity - motion[n:, 3:5], axis=1)
         for k in range(self._sub_steps):
             self._apply_friction(motion[:n, 3:], change if k == 0 else np.zeros(n))
             self._write(self._kick, _KICK)
@@ -101,33 +111,8 @@ class Worlds:
         self.pusher = motion[n:, :2] - self._origin
         self.force = impulse * self.rate
 
-    def _build(self):
-        """One Space with all boxes, then all pushers, which is the order of pymunk.batch's arrays."""
-        n = self.num
-        self._side = int(np.ceil(np.sqrt(n)))
-        self._origin = SPACING * np.stack(np.divmod(np.arange(n), self._side), 1)
-        self.space = pymunk.Space()
-        self.space.iterations = ITERATIONS
-        self.space.collision_slop = 1e-4  # m; the default overlap of 0.1 is as wide as the box
-        self.space.collision_bias = 1e-6  # share of a deeper overlap that is left after 1 s
-        self.space.collision_persistence = 1  # a contact that has ended would still report its last impulse
-        self.bodies = [pymunk.Body(1.0, 1.0) for _ in range(n)]
-        pushers = [pymunk.Body(body_type=pymunk.Body.KINEMATIC) for _ in range(n)]
-        self._shapes = [pymunk.Poly.create_box(b, tuple(task.BOX[:2])) for b in self.bodies]
-        balls = [pymunk.Circle(p, task.RADIUS) for p in pushers]
-        for ball in balls:
-            ball.friction = ball.elasticity = 1.0  # Chipmunk multiplies the pair's values: the box carries the drawn ones
-        for box, pusher, origin in zip(self.bodies, pushers, self._origin.tolist()):
-            box.position = pusher.position = origin  # so far apart that no broad phase sees neighbours
-        self.space.add(*self.bodies, *self._shapes)
-        self.space.add(*pushers, *balls)
-        self._c_boxes = np.array([b._body for b in self.bodies], object)
-        self._c_shapes = np.array([s._shape for s in self._shapes], object)
-        self._motion = np.zeros((2 * n, 6))  # x, y, theta, v_x, v_y, omega of boxes, then pushers
-        self._kick = np.zeros((2 * n, 6))  # v_x, v_y, omega, f_x, f_y, tau
-        self._reader, self._contacts, self._writer = batch.Buffer(), batch.Buffer(), batch.Buffer()
-
     def _read(self):
+        """x, y, theta, v_x, v_y, omega (2 N, 6) of boxes, then pushers: a view, until the next call."""
         self._reader.clear()
         batch.get_space_bodies(self.space, _MOTION, self._reader)
         return np.frombuffer(self._reader.float_buf()).reshape(-1, 6)
@@ -141,11 +126,13 @@ class Worlds:
 
             f = -mu m g v / n,  tau = -mu m g c^2 omega / n,  n = sqrt(v^2 + (c omega)^2).
 
-        Chipmunk gets it as velocities, forces and masses. A box that slides freely moves with its mean velocity of the
-        sub-step. A pushed one would stick and slip where friction can stop it within dt, so for it the law is linearly
-        implicit: mass and moment grow by -dt f / v and -dt tau / omega. Its n is the last one plus `change` (N,), the
-        pusher's change of velocity in m/s, which bounds that of n. A box at rest meets the pusher with the growth of
-        mu_static at MAX_SPEED, and anything else with its static limit surface.
+        With the moment of inertia m k^2 this is d(v, k omega)/dt = -(mu g / n) (v, (c / k)^2 k omega), and with n held for dt
+        a speed loses the share rate = dt mu g / n (1, (c / k)^2) of itself: what remains is 1 - rate where the box slides
+        freely, at rest from rate = 1 on, and 1 / (1 + rate), linearly implicit, where it is pushed: a pushed box would stick
+        and slip where friction can stop it within dt. Chipmunk gets this as velocities, forces and masses: a box that slides
+        freely moves with its mean velocity of the sub-step; of a pushed one mass and moment grow by (1 + rate). Its n is the
+        last one plus `change` (N,), the pusher's change of velocity in m/s, which bounds that of n. A box at rest meets the
+        pusher with the growth of mu_static at MAX_SPEED, and anything else with its static limit surface.
         """
         n = np.linalg.norm(twist * [1.0, 1.0, task.LIMIT_SURFACE_C], axis=1)
         slides = n > REST
@@ -158,13 +145,13 @@ class Worlds:
             pushed = (slides & self._touched)[w, None]
             rate = (self._dynamic[w] / np.maximum(n[w] + pushed[:, 0] * change[w], REST))[:, None] * _SLOWING
             loss = np.minimum(rate, 1.0)
-            left = np.where(pushed, 1.0 / (1.0 + rate), 1.0 - loss)
+            remains = np.where(pushed, 1.0 / (1.0 + rate), 1.0 - loss)
             mean = np.where(pushed, 1.0, 1.0 - loss + loss / np.maximum(rate, 1.0) / 2)
-            self._rest[w] = rest = ~slides[w] | (left == 0.0).all(1)
+            self._rest[w] = rest = ~slides[w] | (remains == 0.0).all(1)
             growth = np.where(rest[:, None], self._static[w, None] / task.MAX_SPEED * _SLOWING, pushed * rate)
             inertia = self._inertia[w] * (1.0 + growth)
             self._kick[w, :3] = twist[w] * mean[:, [0, 0, 1]]
-            self._kick[w, 3:] = twist[w] * (inertia * (left - mean) / self._dt)[:, [0, 0, 1]]
+            self._kick[w, 3:] = twist[w] * (inertia * (remains - mean) / self._dt)[:, [0, 0, 1]]
             _set_all(lib.cpBodySetMass, self._c_boxes[w], inertia[:, 0])
             _set_all(lib.cpBodySetMoment, self._c_boxes[w], inertia[:, 1])
 

@@ -1,60 +1,88 @@
-"""Every policy of the study as one stack of wrappers over PushVectorEnv (sec. 5.2)."""
-import gymnasium as gym
+"""The methods of the study (sec. 5.2): what each policy reads, and its stack of wrappers over PushVectorEnv.
+
+A method whose stack is made of the wrappers at hand is one entry of METHODS: training, evaluation, tables and figures follow.
+"""
+from dataclasses import dataclass
+from typing import Literal
+
 import numpy as np
 
 from common import task
 from common.belief import Believed
 from common.env import PushVectorEnv
-from common.observation import Observed, show
+from common.observation import Observed
 from common.symmetry import Mirrored, mirror
+from common.wrappers import EpisodeWrapper, declare_observations, state_of
 
-# method -> the estimator in its loop
-ESTIMATOR = {"est_uncertainty": "ours", "est": "ours", "est_mse": "mse", "priv_on_estimate": "ours", "end_to_end": None,
-             "behavior_cloning": None, "priv_on_state": None}
+
+@dataclass(frozen=True)
+class EstimatorKind:
+    """A state estimator of stage 03 (tab. estimator_ablation)."""
+
+    label: str
+    likelihood: bool  # trained with eq. 1, else with the mean squared error
+    dropout: bool  # MC dropout in training and use
+
+
+@dataclass(frozen=True)
+class Method:
+    """A policy of the study."""
+
+    label: str  # in the figures
+    reads: Literal["s", "o", "s_hat", "s_hat, sigma"]  # true state, observation with xi, estimate, and with its uncertainty
+    estimator: str | None  # key of ESTIMATORS: the one in its loop
+    training: Literal["pi_priv", "rl", "cloning"]  # pi_priv: the policy of 01, untouched; the others are trained by 04
+
+    @property
+    def size(self):
+        """Width of what the policy reads."""
+        return {"s": 8, "o": 9, "s_hat": 8, "s_hat, sigma": 12}[self.reads]
+
+
+ESTIMATORS = {
+    "ours": EstimatorKind("ours (likelihood + MC dropout)", likelihood=True, dropout=True),
+    "likelihood": EstimatorKind("likelihood loss", likelihood=True, dropout=False),
+    "mse": EstimatorKind("MSE loss", likelihood=False, dropout=False),
+}
+METHODS = {
+    "est_uncertainty": Method(r"$\pi_{est}(\hat{s}, \hat{\Sigma})$", "s_hat, sigma", "ours", "rl"),
+    "est": Method(r"$\pi_{est}(\hat{s})$", "s_hat", "ours", "rl"),
+    "est_mse": Method(r"$\pi_{est}(\hat{s})$, MSE estimator", "s_hat", "mse", "rl"),
+    "priv_on_estimate": Method(r"$\pi_{priv}(\hat{s})$", "s_hat", "ours", "pi_priv"),
+    "end_to_end": Method("end-to-end RL", "o", None, "rl"),
+    "behavior_cloning": Method("behavior cloning", "o", None, "cloning"),
+    "priv_on_state": Method(r"$\pi_{priv}(s)$", "s", None, "pi_priv"),
+}
 
 
 def make(method, num_envs, estimator=None, passes=1, occlusion=None, whole_workspace=False, privileged=False):
     """The vector env that a method's policy acts in.
 
     Args:
-        method: a key of ESTIMATOR.
-        estimator, passes: the estimator that ESTIMATOR names, and its M.
-        occlusion: as in observation.ObservationModel; none for priv_on_state.
-        whole_workspace: starts over the whole workspace.
-        privileged: append the true state, see Privileged.
+        estimator, passes: the estimator that the method names, and its M.
+        occlusion: as in observation.ObservationModel; none where the true state is read.
+        whole_workspace: as in PushVectorEnv; privileged: append the true state, see Privileged.
     """
     env = PushVectorEnv(num_envs, whole_workspace=whole_workspace)
-    env = frame = Mirrored(env if method == "priv_on_state" else Observed(env, occlusion))
-    if ESTIMATOR[method]:
-        env = Believed(env, estimator, passes, sigma=method == "est_uncertainty")
+    env = frame = Mirrored(env if method.reads == "s" else Observed(env, occlusion))
+    if method.estimator:
+        env = Believed(env, estimator, passes, sigma=method.reads == "s_hat, sigma")
     return Privileged(env, frame) if privileged else env
 
 
-class Privileged(gym.vector.VectorWrapper):
-    """A stack whose observations (N, D) are followed by the true state (N, 8), final_obs included.
+class Privileged(EpisodeWrapper):
+    """A stack whose observations (N, D) are followed by the true state (N, 8), in the frame of `frame`, its Mirrored.
 
     For training: the value net reads all of it (an asymmetric critic: Pinto et al. 2018), the policy the first D entries.
-
-    Args:
-        env: the stack.
-        frame: the Mirrored in it, in whose frame the true state is.
     """
 
     def __init__(self, env, frame):
         super().__init__(env)
         self.frame = frame
-        show(self, env.single_observation_space.shape[0] + 8)
+        declare_observations(self, env.single_observation_space.shape[0] + 8)
 
-    def reset(self, *, seed=None, options=None):
-        obs, infos = self.env.reset(seed=seed, options=options)
-        return self._with(obs, infos["state"], self.frame.sign), infos
+    def begin(self, worlds, obs, infos):
+        return np.concatenate([obs, mirror(task.scale(infos["state"][worlds]), self.frame.sign[worlds])], 1)
 
-    def step(self, action):
-        sign = self.frame.sign
-        obs, *rest, infos = self.env.step(action)
-        if "final_obs" in infos:
-            infos["final_obs"] = self._with(infos["final_obs"], infos["final_state"], sign)
-        return self._with(obs, infos["state"], self.frame.sign), *rest, infos
-
-    def _with(self, obs, state, sign):
-        return np.concatenate([obs, mirror(task.scale(state), sign)], 1)
+    def observe(self, obs, infos):
+        return np.concatenate([obs, mirror(task.scale(state_of(infos)), infos["sign"])], 1)

@@ -1,8 +1,8 @@
 """The task's two mirror symmetries: nets only ever see the quarter of the workspace in which their episode began."""
-import gymnasium as gym
 import numpy as np
 
 from common.task import BINS
+from common.wrappers import EpisodeWrapper
 
 # Reflecting x (or y) negates these entries of s = x, y, sin, cos, pusher x, y, force x, y; the box is its own mirror image.
 _FLIPS = np.array([[1, 0, 1, 0, 1, 0, 1, 0], [0, 1, 1, 0, 0, 1, 0, 1]], bool)
@@ -25,17 +25,25 @@ def mirror_action(action, sign):
     return np.where(sign < 0, BINS - 1 - action, action)
 
 
-class Mirrored(gym.vector.VectorWrapper):
-    """What is seen, and the actions, in the frame of each episode's first observation (`signs`)."""
+class Mirrored(EpisodeWrapper):
+    """What is seen, and the actions, in the frame of each episode's first observation (`signs`).
 
-    def reset(self, *, seed=None, options=None):
-        obs, infos = self.env.reset(seed=seed, options=options)
-        self.sign = signs(obs)
-        return mirror(obs, self.sign), infos
+    Infos: `sign` (N, 2), the frame of this step; where an episode ended, of that one. Attribute `sign`: of running episodes.
+    """
 
-    def step(self, action):
-        obs, *rest, infos = self.env.step(mirror_action(action, self.sign))
-        if "final_obs" in infos:
-            infos["final_obs"] = mirror(infos["final_obs"], self.sign)
-            self.sign = np.where(infos["_final_obs"][:, None], signs(obs), self.sign)
-        return mirror(obs, self.sign), *rest, infos
+    def __init__(self, env):
+        super().__init__(env)
+        self.sign = np.ones((env.num_envs, 2), int)
+
+    def begin(self, worlds, obs, infos):
+        self.sign = self.sign.copy()  # the last one stays in the infos of its step
+        self.sign[worlds] = signs(obs)
+        infos.setdefault("sign", self.sign)
+        return mirror(obs, self.sign[worlds])
+
+    def observe(self, obs, infos):
+        infos["sign"] = self.sign
+        return mirror(obs, self.sign)
+
+    def act(self, action):
+        return mirror_action(action, self.sign)

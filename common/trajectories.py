@@ -2,27 +2,23 @@
 import numpy as np
 import torch
 
-from common import artifacts, symmetry, task
-from common.observation import ObservationModel
+from common import observation, runs, speed, symmetry, task
+from common.files import UserError
 
 POOL = 16  # mini-batches that are sorted by length together: random ones are a quarter padding
 
 
 def load(states_path, offsets_path):
-    """Trajectories as states (steps, 7) float32, memory-mapped, and offsets (n + 1,).
+    """States (steps, 7) float32, memory-mapped, and offsets (n + 1,): trajectory i is states[offsets[i]:offsets[i + 1]].
 
-    The i-th trajectory is states[offsets[i]:offsets[i + 1]].
-
-    Raises:
-        artifacts.UserError: the two files do not belong together, or are damaged.
+    Raises UserError if the two files do not belong together, or are damaged.
     """
     try:
         states, offsets = np.load(states_path, mmap_mode="r"), np.load(offsets_path)
-        whole = states.shape == (offsets[-1], 7)
+        if states.shape != (offsets[-1], 7):
+            raise ValueError
     except (ValueError, OSError, EOFError, IndexError):
-        whole = False
-    if not whole:
-        raise artifacts.UserError(f"{states_path} is damaged: rerun 02_collect.py with --force")
+        raise UserError(f"{states_path} is damaged: rerun 02_collect.py with --force") from None
     return states, offsets
 
 
@@ -32,8 +28,8 @@ def files(name):
 
 
 def load_set(cfg, name):
-    """A set of this preset's 02_collect, and the paths it was read from."""
-    paths = {file: artifacts.find(cfg, "02_collect", file) for file in files(name)}
+    """A set of 02_collect, and the paths it was read from."""
+    paths = {file: runs.find(cfg, "02_collect", file) for file in files(name)}
     return load(*paths.values()), paths
 
 
@@ -53,51 +49,54 @@ def batches(indices, size):
 def shuffled(data, size, rng):
     """Indices of all trajectories in batches of `size` in random order; those of a batch are of similar length."""
     lengths = np.diff(data[1])
-    pools = [pool[lengths[pool].argsort(kind="stable")] for pool in batches(rng.permutation(len(lengths)), POOL * size)]
-    parts = [part for pool in pools for part in batches(pool, size)]
+    pools = batches(rng.permutation(len(lengths)), POOL * size)
+    parts = [part for pool in pools for part in batches(pool[lengths[pool].argsort(kind="stable")], size)]
     return [parts[i] for i in rng.permutation(len(parts))]
 
 
-def subset(data, count):
-    """Indices of at most `count` trajectories, evenly spaced over a set, which is in the order of its checkpoints."""
+def subset(data, limit):
+    """Indices of at most `limit` trajectories, evenly spaced over a set, which is in the order of its checkpoints."""
     total = len(data[1]) - 1
-    return np.linspace(0, total - 1, min(count, total)).astype(int)
+    return np.linspace(0, total - 1, min(limit, total)).astype(int)
 
 
-def observe(data, index, seed, device, occlusion=None):
-    """Batch with fresh noise and occlusions: o (T, B, 9), scaled true states (T, B, 8), mask (T, B), on the device.
-
-    Both are in the mirrored frame of the first observation, as in the running stacks.
-    """
+def observe(data, index, seed, device):
+    """Batch of freshly drawn o (T, B, 9) and scaled true states (T, B, 8), mirrored by o[0] as in a stack, and mask (T, B)."""
     states, mask = padded(data, index)
-    o = ObservationModel(len(index), seed, occlusion).trajectory(states)
+    o = observation.ObservationModel(len(index), seed).trajectory(states)
     sign = symmetry.signs(o[0])
     o, s = symmetry.mirror(o, sign), symmetry.mirror(task.scale(states), sign)
     return tuple(torch.as_tensor(x, device=device) for x in (o, s, mask))
 
 
 def pose_errors(q_hat, q, occluded, mask):
-    """Errors of scaled poses (T, B, 4), summed over the valid steps of each trajectory.
+    """Errors of scaled poses (T, B, 4), summed over the valid steps of each trajectory; occluded, mask (T, B).
 
-    Args:
-        q_hat, q: estimated and true poses; occluded, mask: (T, B).
-    Returns:
-        {"all" | "seen" | "occluded": (5, B) sums of (1, |d_xy|, |d_xy|^2, |d_theta|, d_theta^2) in m and rad}.
+    {"all" | "seen" | "occluded": (5, B) sums of (1, |d_xy|, |d_xy|^2, |d_theta|, d_theta^2) in m and rad}.
     """
     q_hat, q = (task.unscale_pose(x.double().cpu().numpy()) for x in (q_hat, q))
     occluded, mask = occluded.cpu().numpy() > 0, mask.cpu().numpy() > 0
     l2 = np.linalg.norm(q_hat[..., :2] - q[..., :2], axis=-1)
     angle = np.abs(task.wrap(q_hat[..., 2] - q[..., 2]))
     terms = np.stack([np.ones_like(l2), l2, l2**2, angle, angle**2])
-    return {name: (terms * chosen).sum(1) for name, chosen in
-            {"all": mask, "seen": mask & ~occluded, "occluded": mask & occluded}.items()}
+    steps = {"all": mask, "seen": mask & ~occluded, "occluded": mask & occluded}
+    return {name: (terms * chosen).sum(1) for name, chosen in steps.items()}
+
+
+def estimates(estimator, passes):
+    """For `measure`: the predictive mean of an estimator (eq. 3) from M passes."""
+    def predict(o):
+        with speed.autocast(o.device):
+            return estimator.predict(o, passes=passes)[0]
+
+    return predict
 
 
 @torch.no_grad()
-def measure(data, count, size, seed, device, predict, occlusion=None):
-    """`pose_errors` of predict(o) -> scaled poses (T, B, 4) over `count` trajectories, the same noise for every predict."""
+def measure(data, limit, size, seed, device, predict):
+    """`pose_errors` of predict(o) (T, B, 4) over at most `limit` trajectories, with the same noise for every predict."""
     parts = []
-    for k, index in enumerate(batches(subset(data, count), size)):
-        o, s, mask = observe(data, index, (seed, 0, k, 3), device, occlusion)
+    for k, index in enumerate(batches(subset(data, limit), size)):
+        o, s, mask = observe(data, index, (seed, 0, k, 3), device)
         parts.append(pose_errors(predict(o), s[..., :4], o[..., 8], mask))
     return {name: np.concatenate([part[name] for part in parts], 1) for name in parts[0]}

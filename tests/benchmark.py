@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-from common import artifacts, networks, ppo, stacks  # noqa: E402
+from common import networks, ppo, speed, stacks  # noqa: E402
 from common.env import PushEnv, PushVectorEnv  # noqa: E402
 from common.observation import ObservationModel, Observed  # noqa: E402
 
@@ -44,7 +44,7 @@ def learn(what, preset, **changes):
     """Rollout and update of pi_priv's nets."""
     stage = importlib.import_module("01_train_privileged")
     hp = stage.Config(**stage.PRESETS[preset] | changes)
-    env = stacks.make("priv_on_state", hp.num_envs)
+    env = stacks.make(stacks.METHODS["priv_on_state"], hp.num_envs)
     actor, critic = networks.policy(8, hp.sizes), networks.value(8, hp.sizes)
     optimizers = [torch.optim.Adam(net.parameters(), lr=1e-4, eps=1e-5) for net in (actor, critic)]
     obs, _ = env.reset(seed=0)
@@ -65,7 +65,7 @@ def learn(what, preset, **changes):
 
 
 def main():
-    artifacts.keep_memory()
+    speed.set_up()
     where = torch.backends.cpu.get_cpu_capability()
     print(f"torch {torch.__version__}, {where}, "
           f"bfloat16 {'yes' if torch.cpu._is_avx512_bf16_supported() else 'no'}\n")
@@ -82,7 +82,7 @@ def main():
         stage = importlib.import_module("03_train_estimator")
         estimator = networks.Estimator(stage.Config(**stage.PRESETS[preset]).sizes).requires_grad_(False)
         for passes in (1, 4, 10, 50):
-            stack = stacks.make("est_uncertainty", WORLDS, estimator, passes)
+            stack = stacks.make(stacks.METHODS["est_uncertainty"], WORLDS, estimator, passes)
             line(f"{name} estimator in the loop, all included, M = {passes}, {WORLDS} worlds", rate(*play(stack, 2)))
     learn("quick's pi_priv", "quick")
     learn("paper's nets, 1024 worlds x 32 steps", "paper", num_envs=WORLDS, rollout_steps=32)

@@ -1,10 +1,16 @@
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+from common import speed  # noqa: E402
+
+speed.set_up()
+SCRIPTS = ["01_train_privileged", "02_collect", "03_train_estimator", "04_train_policy", "05_evaluate", "06_robot"]
 
 
 @pytest.fixture(autouse=True)
@@ -16,3 +22,25 @@ def seeded():
 def float32(monkeypatch):
     """No bfloat16 autocast, where the machine has it."""
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)
+
+
+def start(out, script, *args):
+    command = [sys.executable, ROOT / f"{script}.py", "smoke", "--out", out, "--device", "cpu", *args]
+    return subprocess.Popen(command, cwd=out.parent, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def run(out, script, *args):
+    """Runs a script to its end; returns what it printed."""
+    process = start(out, script, *args)
+    stdout, stderr = process.communicate()
+    assert process.returncode == 0, stderr
+    return stdout
+
+
+@pytest.fixture(scope="session")
+def study(tmp_path_factory):
+    """The root of a whole smoke study. Not to be changed."""
+    out = tmp_path_factory.mktemp("study") / "runs"
+    for script in SCRIPTS:
+        run(out, script)
+    return out

@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-from common import artifacts, episodes, film, networks, stacks, tables, task
+from common import command, episodes, film, networks, runs, stacks, statistics, tables, task, weights
+from common.files import UserError
+from common.progress import bar
 from common.robot import hardware, runlog
 
 REPEATS = 5
@@ -22,35 +24,35 @@ robot = importlib.import_module("06_robot")
 
 
 def main(cfg):
-    folder = artifacts.run_folder(cfg.own, "06_robot", None, cfg.seed)
+    folder = runs.run_folder(cfg.own, "06_robot", None, cfg.seed)
     logs = runlog.read(folder, "natural")
     if not logs:
-        raise artifacts.UserError(f"{folder}: no natural runs; run python 06_robot.py {cfg.preset} --scenario natural first")
-    settings = artifacts.record_of(cfg, folder)["settings"]
+        raise UserError(f"{folder}: no natural runs; run python 06_robot.py {cfg.preset} --scenario natural first")
+    settings = runs.record_of(cfg, folder)["settings"]
     cfg = replace(cfg, **{name: settings[name] for name in ("passes", *vars(hardware.Gaps()))})
     arm, starts = hardware.SimulatedArm(cfg), []
-    for k in artifacts.bar(logs, "starts", unit="run"):
+    for k in bar(logs, "starts", unit="run"):
         robot.prepare(arm, cfg, "natural", k)
         dynamics = {name: value[0] for name, value in arm.worlds.dynamics.items()}
         starts.append({"box": arm.box.copy(), "pusher": arm.points[7, :2]} | dynamics)
     starts = {key: np.array([start[key] for start in starts]) for key in starts[0]}
-    share = tables.robot_runs({"natural": logs})["natural"]["occluded_share"]
+    share = statistics.robot_runs({"natural": logs})["natural"]["occluded_share"]
     seconds = share / (1 - share) / task.OCCLUSION_START / task.RATE
-    estimator = networks.load_estimator(artifacts.find(cfg, "03_train_estimator", "estimator.safetensors", "ours"))
-    policy = networks.load_recurrent(artifacts.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty"))
+    estimator = weights.load(networks.Estimator, runs.find(cfg, "03_train_estimator", "estimator.safetensors", "ours"))
+    policy = weights.load(networks.Recurrent, runs.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty"))
     won, hidden, steps = [], 0, 0
-    for seed in artifacts.bar(REPEATS, "05's world", unit="repeat"):
-        env = film.Recorded(stacks.make("est_uncertainty", len(logs), estimator, cfg.passes, seconds))
+    for seed in bar(REPEATS, "05's world", unit="repeat"):
+        env = film.Recorded(stacks.make(stacks.METHODS["est_uncertainty"], len(logs), estimator, cfg.passes, seconds))
         env.reset = partial(env.reset, options=starts)
         success, length = episodes.play(env, policy, 2**47 + seed)
         won += success.tolist()
         hidden += sum(env.episode(i, n)["o"][:, 8].sum() for i, n in enumerate(length))
         steps += length.sum() + len(length)
-    here = tables.wilson([str(log["ended"]).startswith("success") for log in logs.values()])
+    here = statistics.wilson([str(log["ended"]).startswith("success") for log in logs.values()])
     print(f"robot, natural:          {tables.percent(here)}, {len(logs)} runs, {share:.1%} of the frames occluded\n"
-          f"05's world, same starts: {tables.percent(tables.wilson(won))}, {len(won)} episodes, {hidden / steps:.1%} occluded "
-          f"(occlusions of {seconds:.2f} s)")
+          f"05's world, same starts: {tables.percent(statistics.wilson(won))}, {len(won)} episodes, "
+          f"{hidden / steps:.1%} occluded (occlusions of {seconds:.2f} s)")
 
 
 if __name__ == "__main__":
-    artifacts.main(robot.Config, robot.PRESETS, main, __doc__)
+    command.main(robot.Config, robot.PRESETS, main, __doc__)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from common import film, networks, plots, stacks, tables, task
+from common import film, networks, plots, stacks, statistics, tables, task
 
 evaluate = importlib.import_module("05_evaluate")
 
@@ -34,14 +34,14 @@ def short(monkeypatch):
 
 def first_rows(play, method, chunk=0, **kw):
     """First recorded states, observations and dynamics of a chunk."""
-    env = play.play(evaluate.Measurement(method, 6, **kw), chunk)[2]
+    env = play.chunk(evaluate.Measurement(method, 6, **kw), chunk)[2]
     return env.rows, env.unwrapped.dynamics
 
 
 @pytest.mark.parametrize("successes, n, low, high", [(81, 263, 0.2553, 0.3662), (0, 20, 0.0, 0.1611), (20, 20, 0.8389, 1.0),
                                                      (1880, 2000, 0.9287, 0.9496)])
 def test_wilson_interval_against_published_values(successes, n, low, high):
-    rate = tables.wilson([1] * successes + [0] * (n - successes))
+    rate = statistics.wilson([1] * successes + [0] * (n - successes))
     assert rate["mean"] == successes / n and rate["episodes"] == n
     assert rate["low"] == pytest.approx(low, abs=2e-4) and rate["high"] == pytest.approx(high, abs=2e-4)
 
@@ -49,7 +49,7 @@ def test_wilson_interval_against_published_values(successes, n, low, high):
 @pytest.mark.parametrize("n", [200, 300, 500, 2000])
 def test_wilson_interval_holds_the_rate(n):
     for successes in 0, 1, n - 1, n:
-        rate = tables.wilson([1] * successes + [0] * (n - successes))
+        rate = statistics.wilson([1] * successes + [0] * (n - successes))
         assert 0 <= rate["low"] <= rate["mean"] <= rate["high"] <= 1
 
 
@@ -57,10 +57,10 @@ def test_paired_difference_is_narrower_than_the_independent_one():
     a = np.random.default_rng(0).random(1000) < 0.8
     b = a.copy()
     b[:50] = False
-    d = tables.paired(b, a)
+    d = statistics.paired(b, a)
     assert d["mean"] == pytest.approx(b.mean() - a.mean()) and d["low"] < d["mean"] < d["high"] < 0
     assert d["high"] - d["low"] < 0.03  # independent samples: 0.07
-    assert tables.paired(a, a) == {"mean": 0, "low": 0, "high": 0}
+    assert statistics.paired(a, a) == {"mean": 0, "low": 0, "high": 0}
 
 
 def test_every_method_meets_the_same_episodes(short):
@@ -69,7 +69,7 @@ def test_every_method_meets_the_same_episodes(short):
     rows, dynamics = first_rows(play, "est_uncertainty")
     first = rows[0]
     noise = first["o"][:, [0, 1, 4, 5]] - task.scale(first["state"])[:, [0, 1, 4, 5]]
-    for method in stacks.ESTIMATOR:
+    for method in stacks.METHODS:
         other, _ = first_rows(play, method)
         np.testing.assert_array_equal(other[0]["state"], first["state"])
         if "o" in other[0]:
@@ -106,7 +106,7 @@ def test_an_episode_can_be_played_again(short):
 
 
 def test_recorded_keeps_the_end_of_an_episode(short):
-    success, length, env = players().play(evaluate.Measurement("est", 6, occlusion=0.0), 0)
+    success, length, env = players().chunk(evaluate.Measurement("est", 6, occlusion=0.0), 0)
     for world, n in enumerate(length):
         episode = env.episode(world, n)
         assert len(episode["state"]) == n + 1
@@ -116,24 +116,24 @@ def test_recorded_keeps_the_end_of_an_episode(short):
         assert np.abs(error).max() < 8 * task.NOISE[0]
 
 
-def made_up(seeds=1):
+def made_up(seeds=1, methods=stacks.METHODS):
     """Values of every measurement, as 05 stores them."""
     rng = np.random.default_rng(0)
     row = {"trans_mean_l2_mm": 4.0, "trans_rmse_mm": 3.5, "rot_mean_abs_deg": 2.0, "rot_rmse_deg": 3.0}
     done = {f"estimator_ablation/{kind}": {k: v * (10 if kind == "vision" else 1) for k, v in row.items()} |
-            {"half_95": row, "seen": row, "occluded": row} for kind in evaluate.ESTIMATORS}
+            {"half_95": row, "seen": row, "occluded": row} for kind in ("vision", *reversed(stacks.ESTIMATORS))}
     cfg = evaluate.Config(episodes=40, sweep_episodes=20, switch_episodes=10)
-    for name, m in evaluate.measurements(cfg, {method: range(seeds) for method in evaluate.METHODS}).items():
+    for name, m in evaluate.measurements(cfg, {(method, k): None for method in methods for k in range(seeds)}).items():
         done[name] = rng.integers(0, 2, m.episodes).tolist()
     return done
 
 
 def test_results_have_the_published_layout():
-    results = json.loads(json.dumps(tables.summarise(made_up())))
+    results = json.loads(json.dumps(statistics.summarise(made_up())))
     assert set(results["estimator_ablation"]) == {"vision", "mse", "likelihood", "ours"}
     assert results["estimator_ablation"]["ours"]["trans_mean_l2_mm_of_vision"] == pytest.approx(0.1)
-    assert set(results["success_rate"]) == set(plots.METHODS)
-    assert set(results["occlusion_duration"]) == set(plots.METHODS) - {"priv_on_state"}
+    assert set(results["success_rate"]) == set(stacks.METHODS)
+    assert set(results["occlusion_duration"]) == set(stacks.METHODS) - {"priv_on_state"}
     for points in results["occlusion_duration"].values():
         assert list(points) == ["0", "2.5", "5", "10", "full"]
         assert all(set(p) == {"mean", "low", "high", "episodes"} and p["episodes"] == 20 for p in points.values())
@@ -146,27 +146,39 @@ def test_results_have_the_published_layout():
 
 def test_several_seeds_give_mean_and_std_beside_the_first_seeds_interval():
     done = made_up(seeds=3)
-    row = tables.summarise(done)["success_rate"]["est"]
+    row = statistics.summarise(done)["success_rate"]["est"]
     rates = [np.mean(done[f"success_rate/est/{k}"]) for k in range(3)]
     assert row["mean"] == rates[0]
     assert row["seeds"] == {"mean": pytest.approx(np.mean(rates)), "std": pytest.approx(np.std(rates)), "count": 3}
-    assert "seeds" not in tables.summarise(made_up())["success_rate"]["est"]
+    assert "seeds" not in statistics.summarise(made_up())["success_rate"]["est"]
 
 
 def test_tables_line_up_and_hold_every_method():
-    results = tables.summarise(made_up(seeds=2))
+    results = statistics.summarise(made_up(seeds=2))
     for section in (tables.beside_paper, tables.estimator_ablation, tables.success_rate, tables.occlusion_duration):
         text = section(results)
         lines = [line for line in text.splitlines() if line.startswith("|")]
         assert len({len(line) for line in lines}) == 1 and len(lines[0]) <= 130
         assert len({line.count("|") for line in lines}) == 1
-    assert all(f"| {m} " in tables.success_rate(results) for m in plots.METHODS)
+    assert all(f"| {m} " in tables.success_rate(results) for m in stacks.METHODS)
     assert "10.0%, 10.0%" in tables.estimator_ablation(results) and "(2)" in tables.success_rate(results)
     beside = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tables.beside_paper(results).splitlines()[4:]]
     assert len(beside) == 16 + 6 + 4 + 2 and ["error of ours: mean L2, mm", "4.00 [0.00, 8.00]", "4.42"] in beside
     paper = {name: number for name, _, number in beside}
     assert paper["success of est_uncertainty"] == "94%" and paper["error of ours: mean abs., deg"] == "2.10"
     assert [number for name, number in paper.items() if "contact switches" in name] == ["2.68 +- 1.53", "4.22 +- 2.67"]
+
+
+@pytest.mark.parametrize("others", [[], ["est", "end_to_end"], ["behavior_cloning"]])
+def test_tables_leave_out_what_was_not_measured(others):
+    methods = [*others, "priv_on_state"]  # which 05 demands
+    results = json.loads(json.dumps(statistics.summarise(made_up(methods=methods))))
+    assert list(results["success_rate"]) == methods and "minus_est_uncertainty" not in results["success_rate"][methods[0]]
+    assert list(results["occlusion_duration"]) == list(results["occlusion_loss"]) == others
+    text = "\n\n".join(section(results) for section in (
+        tables.beside_paper, tables.estimator_ablation, tables.success_rate, tables.occlusion_duration, tables.further))
+    told = {m for m in stacks.METHODS if f"| {m} " in text or f"- {m}," in text or f" of {m} " in text}
+    assert told == set(methods)
 
 
 def write_metrics(folder, rows):
@@ -177,12 +189,20 @@ def write_metrics(folder, rows):
 
 
 def test_curves_take_the_seeds_that_came_as_far_as_the_furthest(tmp_path):
+    folders = [tmp_path / f"seed{seed}" for seed in range(4)]
     for seed, last in enumerate((4, 4, 2)):
-        write_metrics(tmp_path / f"seed{seed}", [dict(steps=i, success=i / 10 + seed) for i in range(last + 1)])
-    x, y = plots.curves(tmp_path, "steps", "success")
+        write_metrics(folders[seed], [dict(steps=i / 2, success="" if i % 2 else i / 20 + seed) for i in range(2 * last + 1)])
+    x, y = plots.curves(folders, "steps", "success")  # rows without a value are left out
     assert x.tolist() == [0, 1, 2, 3, 4] and y.shape == (2, 5)
-    assert y[1, 4] == pytest.approx(1.4)
-    assert plots.curves(tmp_path / "none", "steps", "success") == (None, None)
+    assert y[1] == pytest.approx([1.0, 1.1, 1.2, 1.3, 1.4])
+    assert plots.curves(folders[3:], "steps", "success") == (None, None)
+
+
+def test_every_method_has_a_style_of_its_own():
+    for registry in stacks.METHODS, stacks.ESTIMATORS:
+        labels, colours, markers = zip(*map(plots.style, registry))
+        assert list(labels) == [entry.label for entry in registry.values()]
+        assert len(set(labels)) == len(set(colours)) == len(set(markers)) == len(registry)
 
 
 def shape(path):
@@ -197,27 +217,30 @@ def test_every_figure_is_drawn_with_whatever_runs_there_are(tmp_path, short):
         write_metrics(study / run, [dict(steps=i, success=i / 10) for i in range(3)])
     for folder in study, tmp_path / "empty":
         for name in plots.LOSSES:
-            plots.validation_loss(folder, name, tmp_path / f"{folder.name}_{name}.png")
-        plots.success_rate(folder, tmp_path / f"{folder.name}_success_rate.png", {"priv_on_estimate": 0.8})
-        plots.success_rate_priv(folder, tmp_path / f"{folder.name}_success_rate_priv.png")
+            plots.validation_loss([folder], name, tmp_path / f"{folder.name}_{name}.png")
+        plots.success_rate([folder], tmp_path / f"{folder.name}_success_rate.png", {"priv_on_estimate": 0.8})
+        plots.success_rate_priv([folder], tmp_path / f"{folder.name}_success_rate_priv.png")
     assert all((cv2.imread(str(path)) != cv2.imread(str(path).replace("study_", "empty_"))).any()
                for path in tmp_path.glob("study_*.png"))
+    rows = [dict.fromkeys(("train_success", "train_return", "kl", "lr"), math.nan if i == 0 else i) | dict(steps=i)
+            for i in range(3)]
+    plots.training([row | dict(success=0.5 if i == 0 else math.nan) for i, row in enumerate(rows)], tmp_path / "training.png")
     plots.checkpoints([dict(checkpoint=i, episodes=2, success=0.5) for i in range(3)], tmp_path / "checkpoints.png")
     errors = {"trans_mean_l2_mm": 4.0, "rot_mean_abs_deg": 2.0}
     plots.passes({m: errors | {"seen": errors, "occluded": errors} for m in (1, 10)}, tmp_path / "passes.png")
-    results = tables.summarise(made_up())
+    results = statistics.summarise(made_up())
     plots.occlusion_duration(results["occlusion_duration"], tmp_path / "occlusion_duration.png")
     plots.sim(tmp_path / "sim.png")
     pair = {m: play.episode(evaluate.Measurement(m, 6, occlusion=math.inf), 1)
             for m in ("est_uncertainty", "priv_on_estimate")}
     plots.trajectory_with_uncertainty(pair, tmp_path / "trajectory.png", 3, 6, 1)
     images = sorted(tmp_path.glob("*.png"))
-    assert len(images) == 15 and all(min(shape(path)[:2]) >= 350 for path in images)
+    assert len(images) == 16 and all(min(shape(path)[:2]) >= 350 for path in images)
     assert not list(tmp_path.rglob(".*"))  # nothing half-written
 
 
 def test_the_film_shows_every_step(tmp_path, short):
-    _, length, env = players().play(evaluate.Measurement("est_uncertainty", 6, occlusion=1.0), 0)
+    _, length, env = players().chunk(evaluate.Measurement("est_uncertainty", 6, occlusion=1.0), 0)
     episode = env.episode(length.argmax(), length.max())
     film.write(episode, tmp_path / "film.mp4", tmp_path / "film.gif")
     video = cv2.VideoCapture(str(tmp_path / "film.mp4"))

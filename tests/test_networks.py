@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import distributions, nn
 
-from common import artifacts, networks
+from common import files, networks, weights
 
 INPUTS = torch.randn(7, 5, 9)
 
@@ -45,9 +45,8 @@ def test_actions_are_two_categoricals():
     torch.testing.assert_close(share, logp[0, 0].exp(), atol=0.012, rtol=0)
 
 
-@pytest.mark.parametrize("memory", [True, False])
-def test_a_net_goes_step_by_step_or_all_at_once(memory):
-    net = networks.Recurrent(9, 3, (8, 6, 4), memory)
+def test_a_net_goes_step_by_step_or_all_at_once_and_remembers():
+    net = networks.Recurrent(9, 3, (8, 6, 4))
     at_once, _ = net(INPUTS, net.initial(5))
     hidden, steps = net.initial(5), []
     for x in INPUTS:
@@ -56,7 +55,7 @@ def test_a_net_goes_step_by_step_or_all_at_once(memory):
     torch.testing.assert_close(at_once, torch.cat(steps))
     changed = INPUTS.clone()
     changed[0] += 1
-    assert net(changed)[0][-1].equal(at_once[-1]) != memory
+    assert not net(changed)[0][-1].equal(at_once[-1])
 
 
 def test_forget_clears_the_chosen_worlds_only():
@@ -102,13 +101,6 @@ def test_the_lstm_runs_once_and_the_head_m_times():
     torch.testing.assert_close(variance, passes[..., 4:].exp().mean(0) + passes[..., :4].var(0, correction=0))
 
 
-def test_many_passes_of_many_worlds_are_taken_in_parts():
-    f, passes = small(), []
-    f.layers[-1].register_forward_hook(lambda m, x, y: passes.append(len(y)))
-    mean, _, _ = f.predict(torch.randn(2, 2**13, 9), passes=5)
-    assert sorted(passes) == [1, 2, 2] and mean.shape == (2, 2**13, 4)
-
-
 def test_without_dropout_passes_agree_and_mse_knows_no_variance():
     f = small(dropout=0.0)
     q, log_var, _ = f(INPUTS)
@@ -127,7 +119,7 @@ def test_without_dropout_the_head_is_tanh_layers():
 
 
 def test_forget_gates_begin_open():
-    gates = (f := small()).lstm.bias_ih_l0.view(4, 16)  # input, forget, cell, output
+    gates = small().lstm.bias_ih_l0.view(4, 16)  # input, forget, cell, output
     assert (gates[1] == 1).all() and (gates[[0, 2, 3]].abs() <= 16**-0.5).all()
 
 
@@ -135,12 +127,6 @@ def test_forget_gates_begin_open():
 def test_an_estimator_takes_nothing_but_observations(width):
     with pytest.raises(RuntimeError, match="input"):
         small()(torch.zeros(3, 2, width))
-
-
-def test_a_tenth_input_is_zero_and_changes_nothing():
-    f, plain = small(dropout=0.0), nn.LSTM(9, 16)
-    plain.load_state_dict({name: x[:, :9] if name == "weight_ih_l0" else x for name, x in f.lstm.state_dict().items()})
-    torch.testing.assert_close(f.lstm(INPUTS)[0], plain(INPUTS)[0])
 
 
 def test_log_variances_are_clamped():
@@ -204,25 +190,34 @@ def test_mse_is_over_valid_steps():
 
 def test_nets_come_back_from_files(tmp_path):
     net, f = networks.policy(12, (8, 6, 4)), small(dropout=0.0, likelihood=False)
-    for weights in (*net.parameters(), *f.parameters()):
-        weights.data = weights.half().float()  # as the files hold them
-    networks.save_recurrent(policy := tmp_path / "policy.safetensors", net)
-    networks.save_estimator(estimator := tmp_path / "estimator.safetensors", f)
-    assert {x.dtype for path in (policy, estimator) for x in artifacts.load_tensors(path)[0].values()} == {torch.float16}
-    again, f_again = networks.load_recurrent(policy), networks.load_estimator(estimator)
+    for parameter in (*net.parameters(), *f.parameters()):
+        parameter.data = parameter.half().float()  # as the files hold them
+    weights.save(policy := tmp_path / "policy.safetensors", net)
+    weights.save(estimator := tmp_path / "estimator.safetensors", f)
+    assert {x.dtype for path in (policy, estimator) for x in files.load_tensors(path)[0].values()} == {torch.float16}
+    again, f_again = weights.load(networks.Recurrent, policy), weights.load(networks.Estimator, estimator)
     x = torch.randn(3, 2, 12)
-    assert again(x)[0].equal(net(x)[0]) and not again.encoder.weight.requires_grad
-    assert f_again(INPUTS)[0].equal(f(INPUTS)[0]) and (f_again.dropout, f_again.likelihood) == (0.0, False)
+    assert again(x)[0].equal(net(x)[0]) and f_again(INPUTS)[0].equal(f(INPUTS)[0])
+    assert (f_again.dropout, f_again.likelihood) == (0.0, False) and (again.inputs, again.sizes) == (12, (8, 6, 4))
+    assert {x.dtype for net in (again, f_again) for x in net.parameters()} == {torch.float32}
+    assert not any(x.requires_grad for net in (again, f_again) for x in net.parameters())
 
 
 def test_a_damaged_net_is_a_users_error(tmp_path):
-    networks.save_recurrent(path := tmp_path / "policy.safetensors", networks.value(8, (8, 6, 4)))
+    weights.save(path := tmp_path / "policy.safetensors", networks.value(8, (8, 6, 4)))
     path.write_bytes(path.read_bytes()[:-9])
-    with pytest.raises(artifacts.UserError, match="policy.safetensors is missing or damaged"):
-        networks.load_recurrent(path)
+    with pytest.raises(files.UserError, match="policy.safetensors is missing or damaged"):
+        weights.load(networks.Recurrent, path)
 
 
 def test_another_net_than_expected_is_a_users_error(tmp_path):
-    artifacts.save_tensors(path := tmp_path / "estimator.safetensors", networks.value(8, (8, 6, 4)).state_dict(), sizes=(8, 6, 4))
-    with pytest.raises(artifacts.UserError, match="another net than expected: rerun its stage"):
-        networks.load_estimator(path)
+    path, net, sizes = tmp_path / "net.safetensors", networks.value(8, (8, 6, 4)), (8, 6, 4)
+    weights.save(path, net)
+    with pytest.raises(files.UserError, match="another net than expected: rerun its stage"):
+        weights.load(networks.Estimator, path)
+    files.save_tensors(path, net.state_dict(), sizes=sizes)  # an Estimator by its arguments
+    with pytest.raises(files.UserError, match="another net than expected: rerun its stage"):
+        weights.load(networks.Estimator, path)
+    weights.save(path, small())
+    with pytest.raises(files.UserError, match="another net than expected: rerun its stage"):
+        weights.load(networks.Recurrent, path)

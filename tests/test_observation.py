@@ -163,7 +163,7 @@ def test_final_obs_is_of_the_ended_episode_and_the_next_observation_of_the_new_o
     env, actions = Observed(PushVectorEnv(num)), straight(num)
     o, _ = env.reset(seed=0)
     env.model.bias[:12] = [0.1, -0.1, 0.3, 3, -3]  # marks the first episodes, far outside the noise
-    env.model.left[:] = np.where(np.arange(num) < 12, 0, math.inf)
+    env.model.hidden[:] = np.where(np.arange(num) < 12, 0, math.inf)
     env.model.occlusion, held = 0, o[VISION].copy()
     checked = set()
     for _ in range(200):

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
+from torch import nn
 
-from common import networks, ppo, task
+from common import networks, ppo, speed, task
 from common.env import PushVectorEnv
 
 HP = ppo.Hyperparameters(minibatch=10**6, epochs=1)
@@ -55,9 +56,13 @@ class Noise(ToyEnv):
 
 
 class Recall(ToyEnv):
-    """A bit at step 0, then blanks; after 20 of them the first velocity's sign must repeat it."""
+    """A bit at step 0, then blanks; after `blanks` of them the first velocity's sign must repeat it."""
 
-    blanks, size = 20, 2
+    size = 2
+
+    def __init__(self, num_envs, blanks=20):
+        super().__init__(num_envs)
+        self.blanks = blanks
 
     def begin(self, worlds):
         self.bit = getattr(self, "bit", np.zeros(self.num_envs))
@@ -72,8 +77,24 @@ class Recall(ToyEnv):
         return obs, last * np.where(self.success, 1.0, -1.0), last, np.zeros(self.num_envs, bool)
 
 
-def nets(inputs=3, sizes=(8, 6, 5), memory=True):
-    actor, critic = networks.policy(inputs, sizes, memory), networks.value(inputs, sizes, memory)
+class FeedForward(nn.Module):
+    """A net without memory, to be called as networks.Recurrent."""
+
+    def __init__(self, inputs, outputs, width=32):
+        super().__init__()
+        self.inputs = inputs
+        self.layers = nn.Sequential(nn.Linear(inputs, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(),
+                                    nn.Linear(width, outputs))
+
+    def initial(self, batch, device=None):
+        return (torch.zeros(1, batch, 1, device=device),)
+
+    def forward(self, x, hidden):
+        return self.layers(x).float(), hidden
+
+
+def nets(inputs=3, sizes=(8, 6, 5)):
+    actor, critic = networks.policy(inputs, sizes), networks.value(inputs, sizes)
     with torch.no_grad():
         actor.head[-1].weight *= 100  # away from the uniform distribution
     return actor, critic
@@ -159,9 +180,9 @@ def test_whole_sequences_begin_after_episode_ends():
     assert world.tolist() == [0, 0, 1, 2] and start.tolist() == [0, 3, 0, 0]
     padded = ppo.pad(torch.arange(1, 16).view(3, 5).T, position, sequence)
     assert padded.T[:4].tolist() == [[1, 2, 3, 0, 0], [4, 5, 0, 0, 0], [6, 7, 8, 9, 10], [11, 12, 13, 14, 15]]
-    assert not padded[:, 4:].any() and padded.shape[1] == ppo.WIDTH
-    full = torch.arange(ppo.WIDTH)[None]
-    assert ppo.pad(full, 0 * full, full).shape[1] == 2 * ppo.WIDTH
+    assert not padded[:, 4:].any() and padded.shape[1] == speed.WIDTH
+    full = torch.arange(speed.WIDTH)[None]
+    assert ppo.pad(full, 0 * full, full).shape[1] == 2 * speed.WIDTH
 
 
 # Advantages
@@ -207,9 +228,16 @@ def test_the_ratio_is_one_at_the_first_minibatch(tolerance, request):
         request.getfixturevalue("float32")
     actor, critic = nets()
     seq = ppo.sequences(second_rollout(actor, critic), critic, 0.99, 0.95)
-    ratio = ppo.update(actor, critic, optimizers(actor, critic, 1e-2), seq, HP)["ratio"]
-    moved = ppo.update(actor, critic, optimizers(actor, critic), seq, HP)["ratio"]
-    assert ratio < tolerance and moved > 2e-2
+
+    def clipped(clip):
+        return ppo.policy_loss(actor, seq, columns(seq), replace(HP, clip=clip))[1][3]
+
+    with torch.no_grad():
+        assert clipped(tolerance) == 0
+    stats = ppo.update(actor, critic, optimizers(actor, critic, 1e-2), seq, replace(HP, clip=tolerance))
+    assert stats["clip_fraction"] == 0  # the only mini-batch comes before any step
+    with torch.no_grad():
+        assert clipped(2e-2) > 0
 
 
 def test_log_probs_and_gradients_are_those_of_a_plain_loop(float32):
@@ -219,8 +247,8 @@ def test_log_probs_and_gradients_are_those_of_a_plain_loop(float32):
     with torch.no_grad():  # so that some ratios are clipped
         for p in actor.parameters():
             p += 0.1 * torch.randn_like(p)
-    hp = replace(HP, value=0.7)
-    policy_loss, (entropy, kl, _) = ppo.policy_loss(actor, seq, columns(seq), hp)
+    hp = replace(HP, value_coef=0.7)
+    policy_loss, (told, entropy, kl, clipped) = ppo.policy_loss(actor, seq, columns(seq), hp)
     value_loss, (squared,) = ppo.value_loss(critic, seq, columns(seq), hp)
     parameters = [*actor.parameters(), *critic.parameters()]
     fused = torch.autograd.grad(policy_loss + value_loss, parameters)
@@ -231,13 +259,13 @@ def test_log_probs_and_gradients_are_those_of_a_plain_loop(float32):
     now = torch.distributions.Independent(torch.distributions.Categorical(logits=logits), 1)
     old = torch.distributions.Independent(torch.distributions.Categorical(logits=batch["logp"]), 1)
     ratio = (now.log_prob(batch["actions"]) - old.log_prob(batch["actions"])).exp()
-    assert ((ratio - 1).abs() > HP.clip).any()
+    assert told == policy_loss and 0 < clipped == ((ratio - 1).abs() > HP.clip).float().mean()
     surrogate = torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
     plain_squared = (plain_loop(critic, batch, batch["hidden_v"])[0].squeeze(-1) - returns).square().mean()
     torch.testing.assert_close((squared, entropy), (plain_squared.detach(), now.entropy().mean().detach()))
     torch.testing.assert_close(kl, torch.distributions.kl_divergence(old, now).mean().detach())
-    torch.testing.assert_close(policy_loss, -surrogate - hp.entropy * now.entropy().mean())
-    plain = torch.autograd.grad(-surrogate - hp.entropy * now.entropy().mean() + 0.7 * plain_squared, parameters)
+    torch.testing.assert_close(policy_loss, -surrogate - hp.entropy_coef * now.entropy().mean())
+    plain = torch.autograd.grad(-surrogate - hp.entropy_coef * now.entropy().mean() + 0.7 * plain_squared, parameters)
     for a, b in zip(fused, plain):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5)
 
@@ -250,7 +278,7 @@ def test_minibatches_take_every_sequence_once_an_epoch(monkeypatch):
     assert len(taken) == 6  # 175 steps in mini-batches of about 60
     whole = seq["mask"].any(0)
     for epoch in (taken[:3], taken[3:]):
-        assert {len(cols) for cols in epoch} == {ppo.WIDTH}
+        assert {len(cols) for cols in epoch} == {speed.WIDTH}
         order = torch.cat(epoch)
         assert order[whole[order]].sort()[0].equal(whole.nonzero()[:, 0])
         assert max(whole[cols].sum() for cols in epoch) - min(whole[cols].sum() for cols in epoch) <= 1
@@ -261,7 +289,8 @@ def test_no_minibatch_is_empty_where_there_are_fewer_sequences():
     batch = second_rollout(actor, critic, num=2)
     seq = ppo.sequences(batch, critic, 0.99, 0.95)
     stats = ppo.update(actor, critic, optimizers(actor, critic), seq, replace(HP, minibatch=1))
-    assert np.isfinite(list(stats.values())).all()
+    assert np.isfinite(list(stats.values())).all() and stats["explained"] == seq["explained"]
+    assert set(stats) == {"policy_loss", "entropy", "kl", "clip_fraction", "value_loss", "explained", "lr"}
 
 
 def test_the_learning_rate_follows_the_kl_within_its_limits():
@@ -288,7 +317,7 @@ def test_gradients_are_clipped_apart():
         seq = ppo.sequences(second_rollout(*both), both[1], 0.99, 0.95)
         before = [[p.detach().clone() for p in net.parameters()] for net in both]
         steepest = [torch.optim.SGD(net.parameters(), lr=1.0) for net in both]
-        ppo.update(*both, steepest, seq, replace(HP, value=coefficient, grad_norm=0.01, lr_min=1, lr_max=1))
+        ppo.update(*both, steepest, seq, replace(HP, value_coef=coefficient, grad_norm=0.01, lr_min=1, lr_max=1))
         moved.append([torch.cat([(p.detach() - q).flatten() for p, q in zip(net.parameters(), old)])
                       for net, old in zip(both, before)])
     torch.testing.assert_close(moved[0][0], moved[1][0])
@@ -312,22 +341,23 @@ def test_near_starts_fade_and_held_out_episodes_have_none(monkeypatch, tmp_path)
 # Learning
 
 
-def remembers(memory, updates):
+def remembers(actor, critic, updates, blanks=20):
     """Share of bits that a policy repeats at the end of its training."""
-    env, (actor, critic) = Recall(64), nets(2, (32, 32, 32), memory)
-    hp = replace(HP, epochs=8, minibatch=704, kl_target=0.02, lr_min=1e-3, entropy=0.03)
+    env = Recall(64, blanks)
+    hp = replace(HP, epochs=8, minibatch=704, kl_target=0.02, lr_min=1e-3, entropy_coef=0.03)
     both = optimizers(actor, critic, 3e-3)
     carry, share = (env.reset()[0], actor.initial(64), critic.initial(64)), []
     while len(share) < updates and np.mean(share[-5:] or 0) < 0.95:
-        batch, carry = ppo.rollout(env, actor, critic, carry, Recall.blanks + 1)
+        batch, carry = ppo.rollout(env, actor, critic, carry, blanks + 1)
         share.append(batch["success"][1] / batch["success"][0])
         ppo.update(actor, critic, both, ppo.sequences(batch, critic, hp.gamma, hp.lam), hp)
     return np.mean(share[-5:])
 
 
 def test_recurrent_ppo_remembers_over_twenty_blank_steps(float32):
-    assert remembers(memory=True, updates=250) >= 0.95
+    assert remembers(*nets(2, (32, 32, 32)), updates=250) >= 0.95
 
 
 def test_a_feed_forward_policy_cannot(float32):
-    assert remembers(memory=False, updates=60) < 0.7
+    assert remembers(FeedForward(2, 22), FeedForward(2, 1), updates=60) < 0.7
+    assert remembers(FeedForward(2, 22), FeedForward(2, 1), updates=60, blanks=0) >= 0.95  # it learns what needs no memory

@@ -12,7 +12,7 @@ import pytest
 import torch
 from test_robot import placed
 
-from common import artifacts, belief, networks, stacks, symmetry, task
+from common import belief, command, networks, runs, stacks, symmetry, task, weights
 from common.robot import hardware, iiwa, ik, safety, scene, tags
 
 UNUSED = itertools.count(1000)  # seeds
@@ -22,12 +22,12 @@ UNUSED = itertools.count(1000)  # seeds
 def nets(tmp_path_factory):
     """A root with an untrained estimator and policy, as stages 03 and 04 leave them."""
     out = tmp_path_factory.mktemp("robot") / "runs"
-    cfg = artifacts.Stage(preset="smoke", out=out)
-    for stage, method, name, save, net in (
-            ("03_train_estimator", "ours", "estimator.safetensors", networks.save_estimator, networks.Estimator((16, 16, 16))),
-            ("04_train_policy", "est_uncertainty", "policy.safetensors", networks.save_recurrent, networks.policy(12, (16, 16, 16)))):
-        run = artifacts.Run(cfg, stage, {}, method)
-        save(run.dir / name, net)
+    cfg = command.Stage(preset="smoke", out=out)
+    for stage, method, name, net in (
+            ("03_train_estimator", "ours", "estimator.safetensors", networks.Estimator((16, 16, 16))),
+            ("04_train_policy", "est_uncertainty", "policy.safetensors", networks.policy(12, (16, 16, 16)))):
+        run = runs.Run(cfg, stage, {}, method)
+        weights.save(run.dir / name, net)
         run.finish([name])
     return out
 
@@ -40,7 +40,7 @@ def robot(nets, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["06_robot.py", "smoke", "--out", str(nets), "--seed", seed, *args])
         module, code = importlib.import_module("06_robot"), 0
         try:
-            artifacts.main(module.Config, module.PRESETS, module.main, module.__doc__)
+            command.main(module.Config, module.PRESETS, module.main, module.__doc__)
         except SystemExit as end:
             code = end.code
         return *capsys.readouterr(), code, nets / "smoke" / "06_robot" / f"seed{seed}"
@@ -257,7 +257,8 @@ def test_a_run_is_logged_and_filmed_and_its_film_can_be_the_camera(robot, nets):
     _, stderr, code, _ = robot("--scenario", "hand_5s", "--camera", str(film), "--force", seed=3)
     again = np.load(folder / "hand_5s_000.npz")
     assert code == 2 and "camera: no image" in mistakes(stderr)[0]  # the film lacks the first look
-    assert len(again["time"]) >= ticks - 3 and np.linalg.norm((again["true"] - log["true"][:len(again["true"])])[:20, :2]).max() < 2e-3
+    assert len(again["time"]) >= ticks - 3
+    assert np.linalg.norm((again["true"] - log["true"][:len(again["true"])])[:20, :2]).max() < 2e-3
 
 
 def test_force_deletes_no_other_scenario(robot):
@@ -385,7 +386,7 @@ def test_the_program_thinks_as_the_training_stack_does(corner, float32):
     torch.manual_seed(1)
     f, pi = networks.Estimator((16, 16, 16), dropout=0.0).requires_grad_(False), networks.policy(12, (16, 16, 16))
     torch.nn.init.normal_(pi.head[-1].weight)
-    env, think = stacks.make("est_uncertainty", 1, f, 1), importlib.import_module("06_robot").think
+    env, think = stacks.make(stacks.METHODS["est_uncertainty"], 1, f, 1), importlib.import_module("06_robot").think
     start = {"box": [0.1 * corner[0], 0.04 * corner[1], 0.5], "pusher": [0.1 * corner[0], -0.08 * corner[1]]}
     obs, infos = env.reset(seed=0, options=start)
     memory = recall = None

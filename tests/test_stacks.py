@@ -12,7 +12,7 @@ SIZES = (16, 16, 16)
 @pytest.mark.parametrize("method, size", [("end_to_end", 9), ("est", 8), ("est_uncertainty", 12)])
 def test_the_true_state_comes_in_the_frame_of_its_episode(method, size):
     num, rng = 24, np.random.default_rng(0)
-    env = stacks.make(method, num, networks.Estimator((16, 16, 16)), occlusion=0.0, privileged=True)
+    env = stacks.make(stacks.METHODS[method], num, networks.Estimator((16, 16, 16)), occlusion=0.0, privileged=True)
     obs, infos = env.reset(seed=0)
     assert obs.shape == env.observation_space.shape == (num, size + 8)
     drift, ends = rng.choice([-3, 3], (num, 2)), 0
@@ -36,19 +36,20 @@ def test_the_true_state_comes_in_the_frame_of_its_episode(method, size):
 
 
 def test_the_policy_plays_and_learns_without_the_true_state(float32):
-    env, (pi, critic) = stacks.make("end_to_end", 5, privileged=True), (networks.policy(9, SIZES), networks.value(17, SIZES))
+    env = stacks.make(stacks.METHODS["end_to_end"], 5, privileged=True)
+    pi, critic = networks.policy(9, SIZES), networks.value(17, SIZES)
     carry = env.reset(seed=1)[0], pi.initial(5), critic.initial(5)
     batch, _ = ppo.rollout(env, pi, critic, carry, 8)
     assert not batch["done"].any()
     logp = networks.log_softmax(pi(batch["obs"][..., :9])[0])
     torch.testing.assert_close(batch["logp"], logp)
     seq = ppo.sequences(batch, critic, 0.99, 0.95)
-    _, (_, kl, off) = ppo.policy_loss(pi, seq, torch.arange(5), ppo.Hyperparameters())
-    assert kl.abs() < 1e-6 and off < 1e-5
+    _, (_, _, kl, clipped) = ppo.policy_loss(pi, seq, torch.arange(5), ppo.Hyperparameters(clip=1e-5))
+    assert kl.abs() < 1e-6 and clipped == 0
 
 
 def test_a_net_in_a_stack_of_another_width_is_refused():
-    env = stacks.make("end_to_end", 3)
+    env = stacks.make(stacks.METHODS["end_to_end"], 3)
     for inputs in (8, 12):
         with pytest.raises(RuntimeError, match="shapes"):
             episodes.play(env, networks.policy(inputs, SIZES), 0)

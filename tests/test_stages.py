@@ -13,50 +13,30 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from conftest import SCRIPTS, run, start
 
-from common import artifacts, networks, ppo, stacks, tables, task, trajectories
+from common import command, files, networks, ppo, runs, stacks, statistics, task, trajectories, weights
 from common.env import PushVectorEnv
 
 ROOT = Path(__file__).parent.parent
-SCRIPTS = ["01_train_privileged", "02_collect", "03_train_estimator", "04_train_policy", "05_evaluate", "06_robot"]
 SETS = {"train": 48, "validation": 12, "test": 12, "teacher_train": 48, "teacher_validation": 12}
 ESTIMATORS = {"ours", "likelihood", "mse"}
 POLICIES = {"est_uncertainty", "est", "est_mse", "end_to_end", "behavior_cloning"}
 OUTPUTS = {
     "01_train_privileged/seed0": ["policy.safetensors", "value.safetensors", "checkpoint_000.safetensors",
-                                  "checkpoint_001.safetensors", "checkpoint_002.safetensors", "success_rate_priv.png"],
+                                  "checkpoint_001.safetensors", "checkpoint_002.safetensors", "training.png",
+                                  "success_rate_priv.png"],
     "02_collect/seed0": [file for name in SETS for file in trajectories.files(name)] + ["success.png"],
     "03_train_estimator/ours/seed0": ["estimator.safetensors", "likelihood_loss.png", "passes.json", "passes.png"],
     "03_train_estimator/likelihood/seed0": ["estimator.safetensors", "likelihood_loss.png", "passes.json"],
     "03_train_estimator/mse/seed0": ["estimator.safetensors", "mse_loss.png", "passes.json"],
     "04_train_policy/behavior_cloning/seed0": ["policy.safetensors", "bc_loss.png"],
-    "05_evaluate/seed0": ["results.json", "tables.md", "success_rate.png", "occlusion_duration.png", "sim.png",
-                          "trajectory_with_uncertainty.png", "film.mp4", "film.gif", "success_rate_priv.png",
+    "05_evaluate/seed0": ["results.json", "measurements.json", "tables.md", "success_rate.png", "occlusion_duration.png",
+                          "sim.png", "trajectory_with_uncertainty.png", "film.mp4", "film.gif", "success_rate_priv.png",
                           "likelihood_loss.png", "mse_loss.png", "bc_loss.png"],
     "06_robot/seed0": ["summary.json", "robot.png", "natural_000.npz", "hand_5s_000.npz", "hand_full_000.npz"],
-} | {f"04_train_policy/{m}/seed0": ["policy.safetensors", "success_rate.png"] for m in POLICIES - {"behavior_cloning"}}
-
-
-def start(out, script, *args):
-    command = [sys.executable, ROOT / f"{script}.py", "smoke", "--out", out, "--device", "cpu", *args]
-    return subprocess.Popen(command, cwd=out.parent, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-
-
-def run(out, script, *args):
-    """Runs a script to its end; returns what it printed."""
-    process = start(out, script, *args)
-    stdout, stderr = process.communicate()
-    assert process.returncode == 0, stderr
-    return stdout
-
-
-@pytest.fixture(scope="module")
-def study(tmp_path_factory):
-    """The root of a whole smoke study. Not to be changed."""
-    out = tmp_path_factory.mktemp("study") / "runs"
-    for script in SCRIPTS:
-        run(out, script)
-    return out
+} | {f"04_train_policy/{m}/seed0": ["policy.safetensors", "training.png", "success_rate.png"]
+     for m in POLICIES - {"behavior_cloning"}}
 
 
 @pytest.fixture
@@ -76,7 +56,7 @@ def call(monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", [str(ROOT / f"{script}.py"), "smoke", "--out", str(out), "--device", "cpu", *args])
         module, code = importlib.import_module(script), 0
         try:
-            artifacts.main(module.Config, module.PRESETS, module.main, module.__doc__)
+            command.main(module.Config, module.PRESETS, module.main, module.__doc__)
         except SystemExit as end:
             code = end.code
         return *capsys.readouterr(), code
@@ -89,7 +69,7 @@ def is_mistake(stdout, stderr, code, *words):
     return code == 2 and len(lines) == 1 and lines[0].startswith("error: ") and all(word in lines[0] for word in words)
 
 
-def weights(folder):
+def saved(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.glob("*.safetensors"))}
 
 
@@ -120,16 +100,35 @@ def test_checkpoints_go_from_the_untrained_to_the_last_policy(study):
     folder = study / "smoke" / "01_train_privileged" / "seed0"
     torch.manual_seed(0)
     untrained = {name: x.half() for name, x in networks.policy(8, (16, 16, 16)).state_dict().items()}
-    first, middle, last = (artifacts.load_tensors(path)[0] for path in sorted(folder.glob("checkpoint_*")))
-    policy = artifacts.load_tensors(folder / "policy.safetensors")[0]
+    first, middle, last = (files.load_tensors(path)[0] for path in sorted(folder.glob("checkpoint_*")))
+    policy = files.load_tensors(folder / "policy.safetensors")[0]
     assert all(first[name].equal(untrained[name]) and last[name].equal(policy[name]) for name in policy)
     assert not any(middle[name].equal(x[name]) for x in (first, last) for name in policy)
 
 
 def test_success_is_logged_on_schedule(study):
     rows = metrics(study / "smoke" / "01_train_privileged" / "seed0")
-    assert [(int(row["update"]), int(row["steps"])) for row in rows] == [(0, 0), (3, 3 * 512), (6, 6 * 512)]
-    assert all(0 <= float(row["success"]) <= 1 for row in rows)
+    assert [(int(row["update"]), int(row["steps"])) for row in rows] == [(k, 512 * k) for k in range(7)]
+    assert [int(row["update"]) for row in rows if row["success"]] == [0, 3, 6]
+    assert all(0 <= float(row["success"]) <= 1 for row in rows[::3])
+
+
+@pytest.mark.parametrize("folder, updates", [("01_train_privileged", 6), ("04_train_policy/est", 4)])
+def test_every_update_is_logged(study, folder, updates):
+    with open(study / "smoke" / folder / "seed0" / "metrics.csv") as file:
+        first, *rows = csv.DictReader(file)
+    episodes = ["train_success", "train_return", "train_length"]
+    columns = ["policy_loss", "clip_fraction", "kl", "entropy", "value_loss", "explained", "lr", "steps_per_s"]
+    assert list(first) == ["update", "steps", "success", "tolerance", *episodes, *columns]
+    assert all(first[name] == "nan" for name in (*episodes, *columns))
+    assert [int(row["update"]) for row in rows] == [*range(1, updates + 1)]
+    values = {name: np.array([float(row[name]) for row in rows]) for name in first if name != "success"}
+    assert all(np.isfinite(values[name]).all() for name in ("tolerance", *columns))
+    assert np.isfinite(values["train_return"]).any()  # nan where no episode ended
+    for name, low, high in (("train_success", 0, 1), ("train_length", 1, task.HORIZON), ("clip_fraction", 0, 1), ("kl", 0, 1),
+                            ("entropy", 0, 2 * np.log(11) + 1e-4), ("explained", -99, 1), ("lr", 1e-5, 0.1), ("tolerance", 1, 4)):
+        assert np.nanmin(values[name]) >= low and np.nanmax(values[name]) <= high, name
+    assert (values["steps_per_s"] > 0).all() and (values["value_loss"] > 0).all()
 
 
 @pytest.mark.parametrize("name", SETS)
@@ -210,14 +209,16 @@ def test_results_have_every_number(study):
 def test_the_ablation_is_measured_on_the_test_set(study):
     folder, draws = study / "smoke" / "02_collect" / "seed0", importlib.import_module("05_evaluate").LIST
     test = trajectories.load(*(folder / file for file in trajectories.files("test")))
-    f = {m: networks.load_estimator(study / f"smoke/03_train_estimator/{m}/seed0/estimator.safetensors") for m in ESTIMATORS}
+    f = {m: weights.load(networks.Estimator, study / f"smoke/03_train_estimator/{m}/seed0/estimator.safetensors")
+         for m in ESTIMATORS}
     results = json.loads((study / "smoke/05_evaluate/seed0/results.json").read_text())["estimator_ablation"]
     predictions = {"vision": lambda o: o[..., :4], "ours": lambda o: f["ours"].predict(o, passes=200)[0]}
     for name, predict in (predictions | {m: lambda o, m=m: f[m](o)[0] for m in ("mse", "likelihood")}).items():
-        table = tables.error_table(trajectories.measure(test, 12, 100, draws, "cpu", predict))
+        table = statistics.error_table(trajectories.measure(test, 12, 100, draws, "cpu", predict))
         for got, want in [(results[name], table), *((results[name][part], table[part]) for part in ("seen", "occluded"))]:
             for row, reference in ((got, want), (got["half_95"], want["half_95"])):
-                assert [row[key] for key in tables.ERRORS] == pytest.approx([reference[key] for key in tables.ERRORS], rel=0.02)
+                wanted = [reference[key] for key in statistics.ERRORS]
+                assert [row[key] for key in statistics.ERRORS] == pytest.approx(wanted, rel=0.02)
 
 
 def test_the_film_plays(study):
@@ -257,8 +258,20 @@ def test_published_nets_are_evaluated_as_in_their_study(study, call, tmp_path):
     assert not any(str(tmp_path) in path.read_text() for path in out.rglob("config.json"))
 
     shutil.rmtree(published / "03_train_estimator")
-    for script in "05_evaluate", "06_robot":
-        assert is_mistake(*call(out, script, "--weights", str(published)), "missing", f"--weights {published}", "study")
+    assert is_mistake(*call(out, "06_robot", "--weights", str(published)), "missing", f"(and not in --weights {published})",
+                      "run python 03_train_estimator.py smoke --method ours", "first")
+    stdout, _, code = call(out, "05_evaluate", "--weights", str(published))
+    told, = (line for line in stdout.splitlines() if line.startswith("left out, as not trained: "))
+    estimated = ["est_uncertainty", "est", "est_mse", "priv_on_estimate"]
+    names = [f"estimator {kind}" for kind in ("mse", "likelihood", "ours")] + estimated
+    assert code == 0 and told.partition(": ")[2].split("; ") == names
+    results, whole = (json.loads((root / name).read_text()) for root in (out, study))
+    assert results["success_rate"].keys() == whole["success_rate"].keys() - set(estimated)
+    assert list(results["estimator_ablation"]) == ["vision"]
+    for needed in "02_collect", "01_train_privileged":
+        shutil.rmtree(published / needed)
+        words = "missing", f"(and not in --weights {published})", f"run python {needed}.py smoke", "first"
+        assert is_mistake(*call(out, "05_evaluate", "--weights", str(published)), *words)
 
 
 # Stopped and resumed
@@ -273,7 +286,7 @@ def test_a_stopped_run_ends_bit_for_bit_as_an_uninterrupted_one(study, copy, scr
         assert "stopped after" in run(out, script, *which, "--max-minutes", "0")
     assert "stopped after" not in run(out, script, *which, "--max-minutes", "0")
     here, there = (root / "smoke" / script / method / "seed0" for root in (out, study))
-    assert weights(here) == weights(there)
+    assert saved(here) == saved(there)
     assert metrics(here) == metrics(there)
 
 
@@ -297,7 +310,7 @@ def test_a_killed_run_ends_bit_for_bit_as_an_uninterrupted_one(study, tmp_path):
     process.communicate()
     assert process.returncode == -signal.SIGKILL and not (here / "policy.safetensors").exists()
     run(tmp_path / "runs", script)
-    assert weights(here) == weights(there) and metrics(here) == metrics(there)
+    assert saved(here) == saved(there) and metrics(here) == metrics(there)
 
 
 # What goes wrong
@@ -308,6 +321,10 @@ def test_a_killed_run_ends_bit_for_bit_as_an_uninterrupted_one(study, tmp_path):
                                             ("06_robot", "03_train_estimator")])
 def test_a_missing_stage_is_named(tmp_path, call, script, needed):
     assert is_mistake(*call(tmp_path / "runs", script), f"run python {needed}.py smoke", "first")
+
+
+def test_the_test_set_is_demanded(copy, call):
+    assert is_mistake(*call(copy(1), "05_evaluate"), "test_states.npy is missing", "run python 02_collect.py smoke", "first")
 
 
 def test_a_missing_estimator_is_named(copy, call):
@@ -344,11 +361,12 @@ def test_a_training_that_diverged_does_not_finish(copy, call, script, method, ar
     out = copy(SCRIPTS.index(script))
     stdout, stderr, code = call(out, script, "--seed", "1", *(("--method", method) if method else ()), *args)
     assert code == 2 and words in stderr and "Traceback" not in stderr
-    assert not artifacts.record_of(None, out / "smoke" / script / method / "seed1")["finished"]
+    assert not json.loads((out / "smoke" / script / method / "seed1" / "config.json").read_text())["finished"]
 
 
 @pytest.mark.parametrize("script, args, words", [
     ("01_train_privileged", ("--device", "cuda"), "no GPU"), ("02_collect", ("--device", "cuda"), "no GPU"),
+    ("02_collect", ("--seed", "1"), "seed 0's trajectories"),
     ("03_train_estimator", ("--dropout", "1"), "below 1"), ("04_train_policy", ("--sizes", "8", "8", "8"), "--no-warm-start")])
 def test_a_mistake_costs_no_run(study, call, script, args, words, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -368,7 +386,7 @@ def test_a_stale_input_names_the_stage_to_redo(copy, call):
 def test_every_preset_is_a_config(script):
     module = importlib.import_module(script)
     for preset in module.PRESETS:
-        assert artifacts.parse(module.Config, module.PRESETS, module.__doc__, [preset]).preset == preset
+        assert command.parse(module.Config, module.PRESETS, module.__doc__, [preset]).preset == preset
 
 
 def test_mistakes_on_the_command_line_are_one_line(tmp_path):
@@ -399,7 +417,7 @@ def few(monkeypatch):
 
 def test_ppo_updates_the_papers_nets_with_the_papers_estimator():
     module, cfg = paper("04_train_policy", num_envs=8)
-    env = stacks.make("est_uncertainty", cfg.num_envs, networks.Estimator().requires_grad_(False), cfg.passes)
+    env = stacks.make(stacks.METHODS["est_uncertainty"], cfg.num_envs, networks.Estimator().requires_grad_(False), cfg.passes)
     actor, critic = networks.policy(12, cfg.sizes), networks.value(12, cfg.sizes)
     optimizers = [torch.optim.Adam(net.parameters(), lr=cfg.lr) for net in (actor, critic)]
     carry, before = (env.reset(seed=0)[0], actor.initial(8), critic.initial(8)), actor.encoder.weight.clone()
@@ -411,20 +429,20 @@ def test_ppo_updates_the_papers_nets_with_the_papers_estimator():
 
 def test_the_papers_estimator_takes_an_update(tmp_path, few):
     module, cfg = paper("03_train_estimator", method="ours", out=tmp_path)
-    run = artifacts.Run(cfg, "03_train_estimator", {}, "ours")
+    run = runs.Run(cfg, "03_train_estimator", {}, "ours")
     assert module.train(run, cfg, few, few, torch.device("cpu"))
-    f = networks.load_estimator(run.dir / "estimator.safetensors")
+    f = weights.load(networks.Estimator, run.dir / "estimator.safetensors")
     torch.manual_seed(0)
     assert f.sizes == (1024, 512, 256) and not f.lstm.weight_hh_l0.equal(networks.Estimator().lstm.weight_hh_l0)
 
 
 def test_the_papers_student_takes_an_update_toward_its_teacher(tmp_path, few):
     module, cfg = paper("04_train_policy", method="behavior_cloning", bc_epochs=8, out=tmp_path)
-    networks.save_recurrent(path := tmp_path / "teacher.safetensors", teacher := networks.policy(8))
+    weights.save(path := tmp_path / "teacher.safetensors", teacher := networks.policy(8))
     with torch.no_grad():
         teacher.head[-1].bias[3] = teacher.head[-1].bias[11 + 7] = 3.0
-    networks.save_recurrent(path, teacher)
-    run = artifacts.Run(cfg, "04_train_policy", {}, "behavior_cloning")
+    weights.save(path, teacher)
+    run = runs.Run(cfg, "04_train_policy", {}, "behavior_cloning")
     student = module.train_bc(run, cfg, {"policy": path}, torch.device("cpu"))
     losses = [row["validation_loss"] for row in run.rows()]
     assert tuple(student.sizes) == (128, 256, 128) and losses[-1] < losses[0] - 0.5

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from common import networks, supervised
+from common import supervised
 
 
 @pytest.mark.parametrize("slope", [1.0, 1e3])  # the gradient's norm is that, or clipped to 1
@@ -26,23 +26,3 @@ def test_a_step_counts_the_same_in_every_minibatch(slope, monkeypatch, tmp_path)
     gradients, counts = np.array(told).T
     assert len(told) == 8 and counts.max() > 2 * counts.min()
     assert gradients * counts.sum() / 8 == pytest.approx(counts, rel=1e-4)
-
-
-def batch_of(lengths):
-    """Random observations and states of trajectories of these lengths, as trajectories.observe pads them."""
-    steps, count = max(lengths), len(lengths)
-    mask = (torch.arange(steps)[:, None] < torch.tensor(lengths)).float()
-    return torch.randn(steps, count, 9), torch.randn(steps, count, 8), mask
-
-
-@pytest.mark.parametrize("lengths", [[7, 5, 4, 2, 1], [1, 5], [3]])
-def test_halves_have_the_gradient_of_the_whole(lengths, float32):
-    f, batch = networks.Estimator((6, 5, 4), dropout=0.0), batch_of(lengths)
-
-    def gradient(o, s, mask):
-        q_hat, log_var, _ = f(o)
-        return torch.autograd.grad(networks.nll(q_hat, log_var, s[..., :4], mask) * mask.sum(), f.parameters())
-
-    parts = supervised.halves(batch)
-    assert len(parts) == min(2, len(lengths)) and all(mask[-1].any() for _, _, mask in parts)
-    torch.testing.assert_close([sum(shares) for shares in zip(*(gradient(*part) for part in parts))], list(gradient(*batch)))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from common import tables, task, trajectories
-from common.artifacts import UserError
+from common import statistics, task, trajectories
+from common.files import UserError
 
 LENGTHS = [3, 1, 40, 7]
 
@@ -110,9 +110,9 @@ def test_errors_are_those_of_a_plain_loop():
     hidden = rng.random((50, 6)) < 0.4
     tensors = [torch.as_tensor(x) for x in (q_hat, q, hidden.astype(np.float32), mask.astype(np.float32))]
     halves = [trajectories.pose_errors(*(x[:, part] for x in tensors)) for part in (slice(0, 2), slice(2, 6))]
-    table = tables.error_table({name: np.concatenate([half[name] for half in halves], 1) for name in halves[0]})
+    table = statistics.error_table({name: np.concatenate([half[name] for half in halves], 1) for name in halves[0]})
     for row, chosen in ((table["seen"], mask & ~hidden), (table["occluded"], mask & hidden), (table, mask)):
-        assert {key: row[key] for key in tables.ERRORS} == pytest.approx(plain_table(q_hat, q, chosen))
+        assert {key: row[key] for key in statistics.ERRORS} == pytest.approx(plain_table(q_hat, q, chosen))
 
 
 def test_error_intervals_hold_the_truth_as_often_as_they_say():
@@ -121,25 +121,26 @@ def test_error_intervals_hold_the_truth_as_often_as_they_say():
     for _ in range(400):  # trajectories with an error of their own: 200 independent ones, not thousands of steps
         steps = rng.integers(1, 100, 200)
         l2, angle = rng.choice([2 - 0.5**0.5, 2 + 0.5**0.5], 200), rng.choice([0.5, 1.5], 200)
-        row = tables.errors(np.stack([steps, steps * l2, steps * l2**2, steps * angle, steps * angle**2]))
-        held.append(np.abs([row[key] for key in tables.ERRORS] - truth) <= [row["half_95"][key] for key in tables.ERRORS])
+        row = statistics.errors(np.stack([steps, steps * l2, steps * l2**2, steps * angle, steps * angle**2]))
+        held.append(np.abs([row[key] for key in statistics.ERRORS] - truth) <= [row["half_95"][key] for key in statistics.ERRORS])
     assert np.mean(held, 0) == pytest.approx(np.full(4, 0.95), abs=0.035)
 
 
 def test_angles_are_compared_around_the_circle():
     q, q_hat = (torch.tensor([[[0.0, 0.0, math.sin(a), math.cos(a)]]]) for a in (math.radians(179), math.radians(-179)))
-    table = tables.error_table(trajectories.pose_errors(q_hat, q, torch.zeros(1, 1), torch.ones(1, 1)))
+    table = statistics.error_table(trajectories.pose_errors(q_hat, q, torch.zeros(1, 1), torch.ones(1, 1)))
     assert table["rot_mean_abs_deg"] == pytest.approx(2, abs=1e-3) and table["rot_rmse_deg"] == pytest.approx(2, abs=1e-3)
 
 
-def test_vision_alone_has_the_errors_of_its_noise():
+def test_vision_alone_has_the_errors_of_its_noise(monkeypatch):
+    monkeypatch.setattr(task, "OCCLUSION_START", 0.0)
     states = np.zeros((3000 * 20, 7), np.float32)
-    table = tables.error_table(
-        trajectories.measure((states, np.arange(0, 60_001, 20)), 3000, 500, 0, "cpu", lambda o: o[..., :4], occlusion=0))
+    table = statistics.error_table(
+        trajectories.measure((states, np.arange(0, 60_001, 20)), 3000, 500, 0, "cpu", lambda o: o[..., :4]))
     assert table["trans_rmse_mm"] == pytest.approx(2.5 * math.sqrt(2), rel=0.03)
     assert table["trans_mean_l2_mm"] == pytest.approx(2.5 * math.sqrt(2) * math.sqrt(math.pi / 2), rel=0.03)
     assert table["rot_rmse_deg"] == pytest.approx(math.degrees(0.05 * math.sqrt(2)), rel=0.03)
-    assert table["seen"] == {key: table[key] for key in (*tables.ERRORS, "half_95")}
+    assert table["seen"] == {key: table[key] for key in (*statistics.ERRORS, "half_95")}
 
 
 def test_every_estimator_is_measured_under_the_same_noise(data):

@@ -1,8 +1,7 @@
-"""What the robot script needs of an arm and a camera, a simulated arm behind it, and any OpenCV video source as the camera."""
+"""What stage 06 needs of an arm and a camera, a simulated arm behind it, and any OpenCV video source as the camera."""
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -10,18 +9,15 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from common import task
-from common.artifacts import UserError
-from common.robot import iiwa, scene
-from common.robot.ik import QP_RATE
-from common.simulator import Worlds
+from common import simulator, task
+from common.files import UserError
+from common.robot import iiwa, ik, scene
 
 
 class Arm(Protocol):
-    """An arm with a force sensor and a camera, in SI units; times are those of time.monotonic() (the simulated arm has its own).
+    """The five methods that attach an arm with a force sensor and a camera; SI units, times of time.monotonic().
 
-    Whoever attaches a real one writes these five methods. The program calls `command` QP_RATE times a second, and reads joints and
-    wrench before each: both need new readings within 50 ms, and none may wait for one.
+    Joints and wrench are read and `command` is called 150 times a second: readings are at most 50 ms old, no method waits.
     """
 
     def read_joints(self) -> tuple[float, np.ndarray]:
@@ -31,7 +27,7 @@ class Arm(Protocol):
         """Time and the force (3,) in N that the pusher feels, tool frame, weight compensated."""
 
     def grab(self) -> tuple[float, np.ndarray]:
-        """Time of exposure and the newest image (480, 640, 3) uint8 BGR, undistorted; None as an image where there is none."""
+        """Time of exposure and the newest image (480, 640, 3) uint8 BGR, undistorted; the image is None where there is none."""
 
     def command(self, velocity: np.ndarray) -> None:
         """Joint velocities (7,) in rad/s, held until the next call; for safety zero where that does not come within 0.1 s."""
@@ -44,52 +40,40 @@ class Arm(Protocol):
 class Gaps:
     """What the simulated arm has and the training world has not; the force's errors are of that world's size."""
 
-    latency: float = 1.0
-    """camera latency in frames of 1/15 s"""
-    hand_eye_mm: float = 1.0
-    """standard deviation of the calibrated camera position in mm, drawn once a run"""
-    hand_eye_deg: float = 0.2
-    """standard deviation of the calibrated camera rotation in degrees, drawn once a run"""
-    servo_lag: float = 0.02
-    """time constant in s of the joints' first-order response"""
-    tool_mass: float = 0.3
-    """kg beyond the force sensor, whose inertia it feels (the paper's limitation)"""
-    force_bias: float = 0.7
-    """standard deviation of the force sensor's bias in N, drawn once a run (tab. occlusion_and_noise_params)"""
-    force_noise: float = 0.7
-    """standard deviation of each reading of the force sensor in N (tab. occlusion_and_noise_params)"""
+    latency: float = 1.0  # camera latency in frames of 1/15 s
+    hand_eye_mm: float = 1.0  # standard deviation of the calibrated camera position in mm, drawn once a run
+    hand_eye_deg: float = 0.2  # standard deviation of the calibrated camera rotation in degrees, drawn once a run
+    servo_lag: float = 0.02  # time constant in s of the joints' first-order response
+    tool_mass: float = 0.3  # kg beyond the force sensor, whose inertia it feels (the paper's limitation)
+    force_bias: float = 0.7  # standard deviation of its bias in N, drawn once a run (tab. occlusion_and_noise_params)
+    force_noise: float = 0.7  # standard deviation of each reading of the force sensor in N (tab. occlusion_and_noise_params)
 
 
 class SimulatedArm:
-    """An iiwa, its camera and its force sensor over a pymunk world; its clock runs on with each command, by 1/QP_RATE s.
-
-    Attributes: box (3,), the true pose in m, m, rad; covered, whether a hand is over the tags.
-    """
+    """An iiwa, its camera and its force sensor over a pymunk world; its clock runs on with each command, by 1/ik.QP_RATE s."""
 
     def __init__(self, gaps: Gaps):
-        self.gaps, self.stopped = gaps, False
-        self.worlds = Worlds(1, sub_steps=1, rate=QP_RATE)
+        self.gaps, self.worlds, self.stopped = gaps, simulator.Worlds(1, sub_steps=1, rate=ik.QP_RATE), False
 
     def place(self, rng, box, pusher, dynamics, hand=(np.inf, np.inf)):
-        """Starts anew with a box (3,), a pusher (2,), dynamics as simulator.Worlds.place takes them, and a hand from, to (s)."""
-        g = self.gaps
-        self.rng, self.time, self.hand = rng, 0.0, hand
+        """Starts anew: box (3,), pusher (2,), dynamics as simulator.Worlds.place takes them, from when to when a hand (s)."""
+        g, self.rng, self.time, self.hand = self.gaps, rng, 0.0, hand
         self.worlds.place(np.arange(1), box[None], pusher[None], dynamics)
         self.joints, self.speeds = iiwa.joints_at(pusher), np.zeros(7)
         self.points, self.rotation = iiwa.chain(self.joints)[1:]
         self.velocity = self.acceleration = np.zeros(3)  # of the ball
         self.error = rng.normal(0, [g.hand_eye_mm / 1e3] * 3 + [np.deg2rad(g.hand_eye_deg)] * 3)
-        self.bias = rng.normal(0, g.force_bias, 3)
-        self.past = deque(maxlen=1 + round(g.latency * QP_RATE / task.RATE))
+        self.bias = rng.normal(0, g.force_bias, 3)  # N
+        self.past = deque(maxlen=1 + round(g.latency * ik.QP_RATE / task.RATE))
         self.remember()
 
     @property
     def box(self):
-        return self.worlds.box[0]
+        return self.worlds.box[0]  # the true pose (3,) in m, m, rad
 
     @property
     def covered(self):
-        return self.hand[0] <= self.time < self.hand[1]
+        return self.hand[0] <= self.time < self.hand[1]  # whether a hand is over the tags
 
     def remember(self):
         self.past.append((self.time, self.box.copy(), self.points, self.rotation, self.covered))
@@ -99,24 +83,21 @@ class SimulatedArm:
 
     def read_wrench(self):
         felt = np.append(self.worlds.force[0], 0.0) - self.gaps.tool_mass * self.acceleration
-        noise = self.rng.normal(0, self.gaps.force_noise, 3)
-        return self.time, self.rotation.T @ felt + self.bias + noise
+        return self.time, self.rotation.T @ felt + self.bias + self.rng.normal(0, self.gaps.force_noise, 3)
 
     def grab(self):
         time, box, points, rotation, covered = self.past[0]
-        camera = scene.wrist_camera(points, rotation, self.error)
-        return time, scene.photograph(camera, box, points, covered, self.rng)
+        return time, scene.photograph(scene.wrist_camera(points, rotation, self.error), box, points, covered, self.rng)
 
     def command(self, velocity):
-        wanted = np.zeros(7) if self.stopped else velocity
-        lag = self.gaps.servo_lag
-        self.speeds = wanted + (self.speeds - wanted) * (np.exp(-1 / QP_RATE / lag) if lag else 0.0)
-        self.joints = self.joints + self.speeds / QP_RATE
-        before, self.time = self.points[7], self.time + 1 / QP_RATE
+        wanted, lag = np.zeros(7) if self.stopped else velocity, self.gaps.servo_lag
+        self.speeds = wanted + (self.speeds - wanted) * (np.exp(-1 / ik.QP_RATE / lag) if lag else 0.0)
+        self.joints = self.joints + self.speeds / ik.QP_RATE
+        before, self.time = self.points[7], self.time + 1 / ik.QP_RATE
         _, self.points, self.rotation = iiwa.chain(self.joints)
-        velocity = QP_RATE * (self.points[7] - before)
-        self.acceleration, self.velocity = QP_RATE * (velocity - self.velocity), velocity
-        self.worlds.step(QP_RATE * (self.points[7:, :2] - self.worlds.pusher))
+        velocity = ik.QP_RATE * (self.points[7] - before)
+        self.acceleration, self.velocity = ik.QP_RATE * (velocity - self.velocity), velocity
+        self.worlds.step(ik.QP_RATE * (self.points[7:, :2] - self.worlds.pusher))
         self.remember()
 
     def stop(self):
@@ -126,15 +107,10 @@ class SimulatedArm:
 class VideoCamera:
     """A camera that OpenCV opens: of a device number or an address always the newest image, of a file each image in turn.
 
-    Args:
-        source: device number, address or file.
-        clock: tells the arm's time in s.
-        latency: s from an exposure until the image is read.
-    Raises:
-        artifacts.UserError: OpenCV cannot open the source.
+    clock() tells the arm's time in s, latency is from an exposure to its reading, in s; UserError if OpenCV cannot open it.
     """
 
-    def __init__(self, source: str, clock: Callable[[], float], latency: float):
+    def __init__(self, source, clock, latency):
         self.capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
         if not self.capture.isOpened():
             raise UserError(f"--camera {source}: OpenCV cannot open it; give a device number, a file or an address")
@@ -152,7 +128,6 @@ class VideoCamera:
             self.newest = self.read()
 
     def grab(self):
-        """Time and image as Arm.grab has them."""
         return self.newest if self.live else self.read()
 
 
@@ -160,7 +135,7 @@ def pacer(on):
     """wait(), which sleeps until the next QP step is due, and makes up for a late one; wait.slept counts the seconds slept."""
     def wait():
         now = time.perf_counter()
-        wait.due = max(wait.due + 1 / QP_RATE, now - 1 / task.RATE)
+        wait.due = max(wait.due + 1 / ik.QP_RATE, now - 1 / task.RATE)
         if on and wait.due > now:
             time.sleep(wait.due - now)
             wait.slept += wait.due - now

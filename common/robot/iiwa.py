@@ -1,7 +1,6 @@
 """The KUKA LBR iiwa 14 R820 with a pusher on its flange: forward kinematics, Jacobian, limits.
 
-World frame: the workspace's (common/task.py), z up from the table. Tool frame: the flange's, moved along its z axis to the centre
-of the pusher's ball.
+World frame: the workspace's (task.py), z up from the table. Tool frame: the flange's, moved along z to the pusher's ball.
 """
 import numpy as np
 
@@ -27,12 +26,10 @@ _CROSS = np.array([[[(i - j) * (j - k) * (k - i) / 2 for k in range(3)] for j in
 def chain(q):
     """Kinematics at joint angles (7,), world frame.
 
-    Returns:
-        axes (7, 3) of the joints; points (8, 3), one on each axis and the centre of the ball, m; the tool's rotation (3, 3).
+    Returns axes (7, 3) of the joints; points (8, 3) in m, one on each axis and the ball's centre; the tool's rotation (3, 3).
     """
     turns = np.eye(3) + np.sin(q)[:, None, None] * _SKEW + (1 - np.cos(q))[:, None, None] * _SKEW2  # Rodrigues
-    rotation, point = FACING, BASE
-    axes, points = np.empty((7, 3)), np.empty((8, 3))
+    rotation, point, axes, points = FACING, BASE, np.empty((7, 3)), np.empty((8, 3))
     for i, length in enumerate(LENGTHS):
         axes[i], points[i] = rotation @ AXES[i], point
         rotation = rotation @ turns[i]
@@ -57,18 +54,13 @@ def turned(rotation):
 
 
 def joints_at(xy):
-    """Joint angles (7,) that put the ball over (2,) at HEIGHT, pointing down, as near to POSTURE as Newton's steps lead.
-
-    Raises:
-        ValueError: out of reach.
-    """
+    """Joint angles (7,) with the ball over (2,) at HEIGHT, pointing down, near POSTURE; ValueError if that is out of reach."""
     q, goal = POSTURE.copy(), np.array([*xy, HEIGHT])
     for _ in range(200):
         axes, points, rotation = chain(q)
-        error = np.concatenate([goal - points[7], turned(rotation)])
-        j = jacobian(axes, points)
-        inverse = np.linalg.pinv(j, rcond=1e-3)
+        error, j = np.concatenate([goal - points[7], turned(rotation)]), jacobian(axes, points)
         if np.abs(error).max() < 1e-9:
             return q
+        inverse = np.linalg.pinv(j, rcond=1e-3)
         q = q + inverse @ np.clip(error, -0.05, 0.05) + 0.1 * (np.eye(7) - inverse @ j) @ (POSTURE - q)
     raise ValueError(f"no joint angles put the pusher over {xy}")

@@ -37,16 +37,11 @@ def build(q, velocity):
     axes, points, rotation = iiwa.chain(q)
     j, xy, turn = iiwa.jacobian(axes, points), points[7, :2], HOLD * iiwa.turned(rotation)
     turn, rise = np.clip(turn, -TURN, TURN), np.clip(HOLD * (iiwa.HEIGHT - points[7, 2]), -CLIMB, CLIMB)
-
     free, wanted = j[[0, 1, 5]], np.append(np.clip(velocity, -task.MAX_SPEED, task.MAX_SPEED), turn[2])
     hessian = free.T @ (WEIGHTS[:, None] * free) + (DAMPING + POSTURE_WEIGHT) * np.eye(7)
     gradient = -free.T @ (WEIGHTS * wanted) - POSTURE_WEIGHT * POSTURE_GAIN * (iiwa.POSTURE - q)
-
-    room = iiwa.LIMITS - LIMIT_GAP
-    upper = np.clip(HOLD * (room - q), -iiwa.SPEEDS, iiwa.SPEEDS)
-    lower = np.clip(HOLD * (-room - q), -iiwa.SPEEDS, iiwa.SPEEDS)
-    border = task.HALF + MARGIN
-    ahead, behind = (np.maximum(HOLD * (border - side * xy), -task.MAX_SPEED) for side in (1, -1))
+    upper, lower = (np.clip(HOLD * (side * (iiwa.LIMITS - LIMIT_GAP) - q), -iiwa.SPEEDS, iiwa.SPEEDS) for side in (1, -1))
+    ahead, behind = (np.maximum(HOLD * (task.HALF + MARGIN - side * xy), -task.MAX_SPEED) for side in (1, -1))
     bounds = np.concatenate([np.eye(7), -np.eye(7), j[:2], -j[:2]])
     return qpsolvers.Problem(_sparse(hessian), gradient, _sparse(bounds), np.concatenate([upper, -lower, ahead, behind]),
                              _sparse(j[2:5]), np.append(rise, turn[:2]))

@@ -3,25 +3,21 @@ import zipfile
 
 import numpy as np
 
-from common.artifacts import UserError
+from common.files import UserError
 
 
 def log_of(rows, ended):
     """A run as arrays with a row a tick, in s, rad, m, N and the workspace's frame, and how it `ended`.
 
-    `seen` is the last fit of the tags, `age` how many frames ago that was, `residual` (m) of this frame's; sigma is of x, y, sin, cos
-    as the nets have them; `covered` is the hand; `unsolved` counts the programs without a solution; `busy` is the time computed.
+    `seen` is the last fit of the tags, `age` how many frames ago that was, `residual` (m) of this frame's; `sigma` is of x, y,
+    sin, cos as the nets have them; `covered` is the hand; `unsolved` counts programs without a solution; `busy` is computing.
     """
     kept = [key for key in (rows[0] if rows else ()) if key not in ("corners", "image")]
     return {"ended": np.array(ended)} | {key: np.array([row[key] for row in rows]) for key in kept}
 
 
 def read(folder, scenario):
-    """Logs of a scenario: {number of the run: log}.
-
-    Raises:
-        artifacts.UserError: one is damaged.
-    """
+    """Logs of a scenario, {number of the run: log}; UserError if one is damaged."""
     logs = {}
     for path in sorted(folder.glob(f"{scenario}_[0-9]*.npz")):
         try:

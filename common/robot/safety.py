@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from common import task
-from common.artifacts import UserError
-from common.robot import iiwa, scene
-from common.robot.ik import MARGIN, QP_RATE
+from common.files import UserError
+from common.robot import iiwa, ik, scene
 
 FORCE, PEAK = 40.0, 100.0  # N: of the mean over a control step, and of one reading
 SENSOR_AGE, CAMERA_AGE = 0.05, 0.5  # s, of the newest joint angles and wrench, and of the newest image
@@ -18,7 +17,7 @@ FROZEN = 5  # equal images in a row: a live camera's noise never repeats
 UNSOLVED = 3  # programs in a row
 JOINT_GAP = np.deg2rad(0.5)  # rad to a joint's limit; the program keeps 2 degrees
 HEIGHT_GAP, TILT = 0.005, np.deg2rad(2.0)  # m and rad from the pusher's height and direction; the program keeps 0.1 mm
-BORDER = task.HALF + MARGIN + 0.001  # m, farthest place of the pusher: the program's limit, and 1 mm
+BORDER = task.HALF + ik.MARGIN + 0.001  # m, farthest place of the pusher: the program's limit, and 1 mm
 
 
 class Stop(UserError):
@@ -29,20 +28,15 @@ class Guarded:
     """An Arm whose readings are whole, new and within limits, or which has stopped for good and raised Stop.
 
     As a context it is one run: it begins with nothing read, ends with zero velocity, and an exception inside is a Stop.
-
-    Args:
-        arm: hardware.Arm.
-        grab: the camera's, if it is not the arm's own.
-    Attributes:
-        force: mean force (3,) in N of the last control step's readings, tool frame.
+    `arm` is a hardware.Arm; `grab` the camera's, if that is not the arm's own.
     """
 
     def __init__(self, arm, grab=None):
         self.arm, self._grab, self.stopped = arm, grab or arm.grab, ""
 
     def __enter__(self):
-        self._forces, self._unsolved, self._equal, self._image = deque(maxlen=QP_RATE // task.RATE), 0, 0, None
-        self._joints, self._renewed, self._again = deque(maxlen=QP_RATE), wall.monotonic(), 0  # those of the last second
+        self._joints, self._forces = deque(maxlen=ik.QP_RATE), deque(maxlen=ik.QP_RATE // task.RATE)  # a second's, a tick's
+        self._renewed, self._again, self._unsolved, self._equal, self._image = wall.monotonic(), 0, 0, 0, None
         return self
 
     def __exit__(self, kind, error, trace):
@@ -50,15 +44,11 @@ class Guarded:
             return self.command(np.zeros(7))
         if not issubclass(kind, Stop):
             place = traceback.extract_tb(trace)[-1]
-            told = f"{kind.__name__} in {Path(place.filename).name}, line {place.lineno}: {error}"
-            self.stop("Ctrl-C" if kind is KeyboardInterrupt else told)
+            failure = f"{kind.__name__} in {Path(place.filename).name}, line {place.lineno}: {error}"
+            self.stop("Ctrl-C" if kind is KeyboardInterrupt else failure)
 
     def stop(self, reason=""):
-        """Stops the arm for good: for a reason, or at the end of the program.
-
-        Raises:
-            Stop: there is a reason, or the arm's own stop failed.
-        """
+        """Stops the arm for good; a Stop if there is a reason (none at the program's end), or the arm's own stop failed."""
         self.stopped = self.stopped or reason and f"arm stopped: {reason}"
         try:
             self.arm.stop()
@@ -84,10 +74,11 @@ class Guarded:
         for i in np.flatnonzero(np.abs(q) > iiwa.LIMITS - JOINT_GAP):
             self.stop(f"joint {i + 1} is at its limit, {np.rad2deg(q[i]):.1f} degrees")
         _, points, rotation = iiwa.chain(q)
-        (x, y, z), tilt = points[7], np.arccos(np.clip((np.trace(rotation.T @ iiwa.DOWN) - 1) / 2, -1, 1))
+        x, y, rise = points[7] - [0, 0, iiwa.HEIGHT]
+        tilt = np.arccos(np.clip((np.trace(rotation.T @ iiwa.DOWN) - 1) / 2, -1, 1))
         self.require(abs(x) <= BORDER[0] and abs(y) <= BORDER[1], f"the pusher is beyond the border, at {x:.3f}, {y:.3f} m")
-        self.require(abs(z - iiwa.HEIGHT) <= HEIGHT_GAP and tilt <= TILT,
-                     f"the pusher is {1e3 * (z - iiwa.HEIGHT):.1f} mm above its height and turned by {np.rad2deg(tilt):.1f} degrees")
+        self.require(abs(rise) <= HEIGHT_GAP and tilt <= TILT,
+                     f"the pusher is {1e3 * rise:.1f} mm above its height and turned by {np.rad2deg(tilt):.1f} degrees")
         return time, q
 
     def joints_then(self, time):
@@ -111,14 +102,15 @@ class Guarded:
 
     @property
     def force(self):
+        """Mean force (3,) in N of the last control step's readings, tool frame."""
         return np.mean(self._forces, 0)
 
     def grab(self):
         """Time and image (480, 640, 3) uint8 BGR, a copy. Call it after read_joints."""
         time, image = self._grab()
         self.require(image is not None, "camera: no image")
-        self.require(np.shape(image) == (*scene.SIZE[::-1], 3),
-                     f"camera: images of shape {np.shape(image)}, not {(*scene.SIZE[::-1], 3)} as common/robot/scene.py has it")
+        shape, due = np.shape(image), (*scene.SIZE[::-1], 3)
+        self.require(shape == due, f"camera: images of shape {shape}, not {due} as common/robot/scene.py has it")
         self._check_age("camera", time, CAMERA_AGE)
         self._equal = self._equal + 1 if self._image is not None and np.array_equal(image, self._image) else 0
         self._image = image.copy()

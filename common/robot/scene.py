@@ -4,7 +4,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from common import env, geometry, task
+from common import draw, geometry, task
 from common.robot import iiwa, tags
 
 NEAR = 0.03  # m, nothing nearer is drawn
@@ -17,15 +17,12 @@ STEEL, ORANGE, SKIN, RED = (175, 170, 165), (40, 110, 235), (150, 180, 225), (40
 
 @dataclass
 class Camera:
-    """A pinhole camera: `focal` and `size` (width, height) in pixels, the centre in the middle of the image.
+    """A pinhole camera, the centre in the middle of its image."""
 
-    rotation (3, 3): its axes (right, down, forward) as columns, world frame; position (3,) in m.
-    """
-
-    focal: float
-    size: tuple[int, int]
-    rotation: np.ndarray
-    position: np.ndarray
+    focal: float  # pixels
+    size: tuple[int, int]  # width, height in pixels
+    rotation: np.ndarray  # (3, 3), its axes (right, down, forward) as columns, world frame
+    position: np.ndarray  # (3,) in m
 
     def project(self, points):
         """Pixels (..., 2) of points (..., 3) in m, and their depths (...) in m."""
@@ -40,8 +37,7 @@ class Camera:
     def plane(self, height):
         """Homography (3, 3) from (x, y, 1) in m on the plane z = height to pixels."""
         k = np.array([[self.focal, 0, (self.size[0] - 1) / 2], [0, self.focal, (self.size[1] - 1) / 2], [0, 0, 1]])
-        world = self.rotation.T
-        return k @ np.stack([world[:, 0], world[:, 1], world @ ([0, 0, height] - self.position)], 1)
+        return k @ np.column_stack([self.rotation[:2].T, self.rotation.T @ ([0, 0, height] - self.position)])
 
 
 def _looking(position, at, right):
@@ -49,22 +45,21 @@ def _looking(position, at, right):
     forward = (at - position) / np.linalg.norm(at - position)
     right = right - right @ forward * forward
     right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward], 1)
+    return np.column_stack([right, np.cross(forward, right), forward])
 
 
 # The robot's camera: beside the stem, 0.2 m above the ball and looking at it; 60 degrees wide. World frame, tool pointing down
 FOCAL, SIZE = 550.0, (640, 480)
 MOUNT = np.array([0.05, -0.05, 0.20])  # m, from the centre of the ball
 LOOK = _looking(MOUNT, np.zeros(3), np.array([1.0, 0.0, 0.0]))  # its axes (right, down, forward) as columns
-_BESIDE = np.array([0.75, 0.95, 0.75])
-OVERVIEW = Camera(780.0, SIZE, _looking(_BESIDE, np.array([0.0, -0.1, 0.2]), np.array([-1.0, 0.75, 0.0])), _BESIDE)  # for figures
+_BESIDE = np.array([0.75, 0.95, 0.75])  # where figures are seen from
+OVERVIEW = Camera(780.0, SIZE, _looking(_BESIDE, np.array([0.0, -0.1, 0.2]), np.array([-1.0, 0.75, 0.0])), _BESIDE)
 
 
 def wrist_camera(points, rotation, error=np.zeros(6)):
     """The robot's camera for an arm's points (8, 3) and tool rotation (3, 3), as iiwa.chain gives them.
 
-    Args:
-        error: (6,) what hand-eye calibration missed: a shift in m and a rotation vector in rad about the camera, tool frame.
+    `error` (6,) is what hand-eye calibration missed: a shift in m and a rotation vector in rad about the camera, tool frame.
     """
     turn = rotation @ cv2.Rodrigues(error[3:])[0] @ iiwa.DOWN.T
     return Camera(FOCAL, SIZE, turn @ LOOK, points[7] + rotation @ (iiwa.DOWN.T @ MOUNT + error[:3]))
@@ -72,19 +67,19 @@ def wrist_camera(points, rotation, error=np.zeros(6)):
 
 def _table():
     """Texture of 1.4 m x 1.2 m around (0, 0), 1 mm a pixel: wood, the workspace's border and the target's outline."""
-    rng = np.random.default_rng(0)
-    grain = cv2.GaussianBlur(rng.normal(0, 60, (1200, 1400)).astype(np.float32), (0, 0), sigmaX=40, sigmaY=1)
-    image = np.clip(np.array(WOOD) + 2.5 * grain[..., None], 0, 255).astype(np.uint8)
-    for corners, colour in ((env.SQUARE * task.HALF, (110, 110, 110)), (env.corners(np.zeros(3)), (190, 120, 40))):
-        points = np.round(corners * [1000, -1000] + [700, 600]).astype(np.int32)
-        cv2.polylines(image, [points], True, colour, 2, cv2.LINE_AA)
+    noise = np.random.default_rng(0).normal(0, 60, (1200, 1400)).astype(np.float32)
+    grain = 2.5 * cv2.GaussianBlur(noise, (0, 0), sigmaX=40, sigmaY=1)
+    image = np.clip(np.array(WOOD) + grain[..., None], 0, 255).astype(np.uint8)
+    for corners, colour in ((draw.SQUARE * task.HALF, (110, 110, 110)), (draw.corners(np.zeros(3)), (190, 120, 40))):
+        cv2.polylines(image, [np.round(corners * [1000, -1000] + [700, 600]).astype(np.int32)], True, colour, 2, cv2.LINE_AA)
     return image
 
 
 _TABLE = _table()
 _TABLE_TO_M = np.array([[0.001, 0, -0.6995], [0, -0.001, 0.5995], [0, 0, 1]])
 _TOP = cv2.GaussianBlur(tags.sheet(), (0, 0), 1.5)
-_TOP_TO_M = np.array([[1, 0, 0.5 - tags.SCALE * task.BOX[0] / 2], [0, -1, tags.SCALE * task.BOX[1] / 2 - 0.5], [0, 0, tags.SCALE]])
+_LEFT, _UPPER = tags.SCALE * task.BOX[:2] / 2 - 0.5
+_TOP_TO_M = np.array([[1, 0, -_LEFT], [0, -1, _UPPER], [0, 0, tags.SCALE]])
 _GRAIN = np.random.default_rng(1).normal(0, NOISE, (2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.int16)
 
 
@@ -98,10 +93,10 @@ def _limb(image, camera, a, b, radius_a, radius_b, colour):
     if depth.max() < 2 * NEAR:
         return
     if depth.min() < NEAR:  # cut off what is too near
-        near, far = (a, b) if depth[0] < depth[1] else (b, a)
+        if depth[0] >= depth[1]:
+            a, b, radius_a, radius_b = b, a, radius_b, radius_a
         share = (2 * NEAR - depth.min()) / (depth.max() - depth.min())
-        pixels, depth = camera.project(np.stack([near + share * (far - near), far]))
-        radius_a, radius_b = (radius_a, radius_b) if near is a else (radius_b, radius_a)
+        pixels, depth = camera.project(np.stack([a + share * (b - a), b]))
     along = pixels[1] - pixels[0]
     across = np.array([-along[1], along[0]]) / max(np.linalg.norm(along), 1e-9)
     radii = camera.focal * np.array([radius_a, radius_b]) / depth
@@ -116,9 +111,8 @@ def _limb(image, camera, a, b, radius_a, radius_b, colour):
 
 def _box(image, camera, box):
     """The four sides that face the camera, and the top with its tags."""
-    ground = env.corners(box)
-    for i in range(4):
-        a, b = ground[i], ground[(i + 1) % 4]
+    ground = draw.corners(box)
+    for a, b in zip(ground, np.roll(ground, -1, 0)):
         out = np.array([b[1] - a[1], a[0] - b[0]]) / np.linalg.norm(b - a)
         if out @ (camera.position[:2] - a) > 0:
             side = np.array([[*a, 0], [*b, 0], [*b, task.BOX[2]], [*a, task.BOX[2]]])
@@ -129,52 +123,44 @@ def _box(image, camera, box):
     high = np.minimum(np.ceil(top.max(0)).astype(int) + 2, camera.size)
     if (high <= low).any():
         return
-    cos, sin = np.cos(box[2]), np.sin(box[2])
-    to_world = np.array([[cos, -sin, box[0]], [sin, cos, box[1]], [0, 0, 1]]) @ _TOP_TO_M
+    to_world = np.vstack([np.column_stack([geometry.rotation(box[2]), box[:2]]), [0, 0, 1]]) @ _TOP_TO_M
     crop = np.array([[1, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]])
     warp, size = crop @ camera.plane(task.BOX[2]) @ to_world, (high - low).tolist()
     texture = cv2.warpPerspective(_TOP, warp, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     mask = np.zeros(texture.shape, np.uint8)
     _fill(mask, top - low, 255)
-    part = image[low[1]:high[1], low[0]:high[0]]
-    part[:] = cv2.blendLinear(cv2.cvtColor(texture, cv2.COLOR_GRAY2BGR), part, mask / np.float32(255), 1 - mask / np.float32(255))
-
-
-def _hand(image, camera, box):
-    """A hand flat over the tags, its arm coming from +x."""
-    palm = np.array([box[0], box[1], HAND])
-    _limb(image, camera, palm + [0.02, 0, 0.0], palm + [0.45, 0.12, 0.12], 0.05, 0.045, SKIN)
-    for y in (-0.05, -0.017, 0.017, 0.05):
-        _limb(image, camera, palm + [0.03, 0.9 * y, 0], palm + [-0.09, 1.2 * y, 0], 0.024, 0.016, SKIN)
-    _limb(image, camera, palm + [0.03, -0.03, 0], palm + [-0.02, -0.085, 0], 0.028, 0.018, SKIN)
-    _limb(image, camera, palm + [0.03, 0, 0], palm + [-0.02, 0, 0], 0.07, 0.068, SKIN)
+    share, part = mask / np.float32(255), image[low[1]:high[1], low[0]:high[0]]
+    part[:] = cv2.blendLinear(cv2.cvtColor(texture, cv2.COLOR_GRAY2BGR), part, share, 1 - share)
 
 
 def render(camera, box, points, hand=False, arm=False):
-    """Image (height, width, 3) uint8 BGR of a box pose (3,), the arm's points (8, 3) and, where told, a hand and the arm."""
+    """Image (height, width, 3) uint8 BGR of a box pose (3,), the pusher at the arm's points (8, 3), a hand and the arm."""
     image = cv2.warpPerspective(_TABLE, camera.plane(0.0) @ _TABLE_TO_M, camera.size, flags=cv2.INTER_LINEAR,
                                 borderMode=cv2.BORDER_CONSTANT, borderValue=(225, 222, 218))
     ball, flange = points[7], points[7] + (points[6] - points[7]) * iiwa.TOOL / np.linalg.norm(points[6] - points[7])
     waist = ball + (flange - ball) * np.clip((task.BOX[2] - ball[2]) / (flange[2] - ball[2]), 0, 1)
-
-    def draw_tip():
-        _limb(image, camera, ball, waist, STEM, STEM, STEEL)
-        _limb(image, camera, ball, ball, task.RADIUS, task.RADIUS, RED)
-
-    cos, sin = np.cos(box[2]), np.sin(box[2])
-    point = box[:2] + np.array([[cos, -sin], [sin, cos]]) @ geometry.nearest(box, ball[:2])[1]
-    before = (ball[:2] - point) @ (camera.position[:2] - point) > 0  # a plane at `point` parts ball and box
-    for draw in (lambda: _box(image, camera, box), draw_tip) if before else (draw_tip, lambda: _box(image, camera, box)):
-        draw()
+    point = box[:2] + geometry.rotation(box[2]) @ geometry.nearest(box, ball[:2])[1]
+    behind = (ball[:2] - point) @ (camera.position[:2] - point) > 0  # the box, which a plane at `point` parts from the ball
+    if behind:
+        _box(image, camera, box)
+    _limb(image, camera, ball, waist, STEM, STEM, STEEL)
+    _limb(image, camera, ball, ball, task.RADIUS, task.RADIUS, RED)
+    if not behind:
+        _box(image, camera, box)
     _limb(image, camera, waist, flange, STEM, STEM, STEEL)
     if arm:
-        joints = [points[0], points[1], points[3], points[5], flange]
+        joints = [*points[[0, 1, 3, 5]], flange]
         for a, b, r, s in zip(joints[:-1], joints[1:], (0.09, 0.08, 0.075, 0.06), (0.08, 0.075, 0.065, 0.045)):
             _limb(image, camera, a, b, r, s, STEEL)
         for joint, radius in zip(joints[1:-1], (0.082, 0.078, 0.068)):
             _limb(image, camera, joint, joint, 0.6 * radius, 0.6 * radius, ORANGE)
-    if hand:
-        _hand(image, camera, box)
+    if hand:  # flat over the tags, its arm coming from +x
+        palm = np.array([*box[:2], HAND])
+        _limb(image, camera, palm + [0.02, 0, 0], palm + [0.45, 0.12, 0.12], 0.05, 0.045, SKIN)
+        for y in (-0.05, -0.017, 0.017, 0.05):
+            _limb(image, camera, palm + [0.03, 0.9 * y, 0], palm + [-0.09, 1.2 * y, 0], 0.024, 0.016, SKIN)
+        _limb(image, camera, palm + [0.03, -0.03, 0], palm + [-0.02, -0.085, 0], 0.028, 0.018, SKIN)
+        _limb(image, camera, palm + [0.03, 0, 0], palm + [-0.02, 0, 0], 0.07, 0.068, SKIN)
     return image
 
 

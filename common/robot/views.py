@@ -2,42 +2,32 @@
 import cv2
 import numpy as np
 
-from common import film, task
-from common.observation import assemble
+from common import film, observation, task
 from common.robot import iiwa, scene
 
 FOUND = (60, 220, 60)
 
 
 def panels(row, tick):
-    """Three RGB images of one tick: from outside, by the robot's camera, from above.
-
-    Args:
-        row: what 06_robot.py logs of a tick; the true pose may be nan (a real arm), then the estimate stands for it.
-        tick: of the run.
-    """
+    """RGB images of a tick: from outside, by the robot's camera, from above; without a true pose the estimate stands for it."""
     box = row["estimated"] if np.isnan(row["true"]).any() else row["true"]
-    points = iiwa.chain(row["joints"])[1]
-    outside = scene.render(scene.OVERVIEW, box, points, row["covered"], arm=True)
+    outside = scene.render(scene.OVERVIEW, box, iiwa.chain(row["joints"])[1], row["covered"], arm=True)
     seen = row["image"].copy()
-    for corners in row["corners"]:
-        cv2.polylines(seen, [np.round(16 * corners).astype(np.int32)], True, FOUND, 2, cv2.LINE_AA, 4)
+    cv2.polylines(seen, list(np.round(16 * row["corners"]).astype(np.int32)), True, FOUND, 2, cv2.LINE_AA, 4)
     state, noisy, s_hat = (np.concatenate([pose, row["pusher"], row["force"]]) for pose in (box, row["seen"], row["estimated"]))
-    o = assemble(noisy[None], np.array([row["age"] > 0]))[0]
+    o = observation.assemble(noisy[None], np.array([row["age"] > 0]))[0]
     above = film.frame(state, o, np.append(task.scale(s_hat), row["sigma"]), tick)
     return outside[..., ::-1], seen[..., ::-1], above[:film.WIDTH // 2]  # without its text, which tells of the truth
 
 
 def columns(rows, count=5):
     """(time in s, occluded, panels) at `count` instants, evenly spaced from the first tick to the last."""
-    return [(i / task.RATE, rows[i]["age"] > 0, panels(rows[i], i))
-            for i in np.linspace(0, len(rows) - 1, count).astype(int)]
+    return [(i / task.RATE, rows[i]["age"] > 0, panels(rows[i], i)) for i in np.linspace(0, len(rows) - 1, count).astype(int)]
 
 
 def write(rows, path, camera_path):
     """Writes the three views of a run side by side as an mp4, and the robot's camera alone as another."""
-    def wide(views):
-        return np.hstack([cv2.resize(v, (v.shape[1] * scene.SIZE[1] // v.shape[0], scene.SIZE[1])) for v in views])
-
-    film.write_mp4(path, (wide(panels(row, tick)) for tick, row in enumerate(rows)))
+    height = scene.SIZE[1]
+    film.write_mp4(path, (np.hstack([cv2.resize(view, (view.shape[1] * height // view.shape[0], height))
+                                     for view in panels(row, tick)]) for tick, row in enumerate(rows)))
     film.write_mp4(camera_path, (row["image"][..., ::-1] for row in rows))

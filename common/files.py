@@ -1,0 +1,69 @@
+"""Files that are whole or not there, and a user's mistake told in one line."""
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import safetensors.torch
+import torch
+
+
+class UserError(Exception):
+    """A user's mistake: one line, what is wrong and what to do."""
+
+
+def write_atomic(path: Path, write: Callable[[Path], object]):
+    """Calls write with a temporary path beside `path`, of the same suffix, and renames the result to `path`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+    try:
+        write(temporary)
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def save_json(path: Path, obj, indent: int | None = 2):
+    """Writes JSON; arrays and tensors become lists, paths strings."""
+    text = json.dumps(obj, indent=indent, default=lambda x: x.tolist() if hasattr(x, "tolist") else str(x))
+    write_atomic(path, lambda temporary: temporary.write_text(text + "\n"))
+
+
+def load_json(path: Path, advice: str):
+    """JSON of a file, None where there is none.
+
+    Raises UserError: it is damaged; the advice says what to do.
+    """
+    try:
+        return json.loads(path.read_text()) if path.exists() else None
+    except ValueError:
+        raise UserError(f"{path} is damaged: {advice}") from None
+
+
+def save_tensors(path: Path, tensors: dict[str, torch.Tensor], **meta):
+    """Writes a safetensors file; meta is anything that JSON holds."""
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    data = safetensors.torch.save(tensors, {"meta": json.dumps(meta)})  # one key: safetensors shuffles several
+    write_atomic(path, lambda temporary: temporary.write_bytes(data))
+
+
+def load_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict]:
+    """The tensors, on the CPU, and the meta of save_tensors.
+
+    Raises UserError: the file is missing or damaged.
+    """
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            meta = json.loads((file.metadata() or {}).get("meta", "{}"))
+            return {name: file.get_tensor(name) for name in file.keys()}, meta
+    except (safetensors.SafetensorError, OSError, ValueError):
+        raise UserError(f"{path} is missing or damaged: rerun its stage with --force") from None
+
+
+def digest(path: Path) -> dict:
+    """{"sha256", "bytes"} of a file."""
+    with open(path, "rb") as file:
+        return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), "bytes": path.stat().st_size}

@@ -1,0 +1,248 @@
+"""Run folders: what a stage did and from what, where it stands, and what the earlier stages made.
+
+<out>/<preset>/<stage>/[method/]seed<k>/ holds config.json (settings, versions, sha256 of inputs and outputs, finished or
+not), metrics.csv, resume.pt while unfinished, and the artifacts.
+"""
+import contextlib
+import csv
+import fcntl
+import io
+import json
+import os
+import re
+import shutil
+import sys
+import time
+from dataclasses import fields
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+
+from common.command import Stage
+from common.files import UserError, digest, load_json, save_json, write_atomic
+
+VERSIONS = ("torch", "numpy", "pymunk", "gymnasium", "opencv-python-headless", "clarabel")
+_STARTED = time.monotonic()
+_locks = {}  # folder -> descriptor that holds its lock for this process
+
+
+class Missing(UserError):
+    """What an earlier stage has not made, or not finished."""
+
+
+def run_folder(study: Path, stage: str, method: str | None = None, seed: int = 0) -> Path:
+    """<study>/<stage>/[method/]seed<k>."""
+    return study / stage / (method or "") / f"seed{seed}"
+
+
+def seeds(roots: list[Path], stage: str, method: str | None = None) -> dict[int, Path]:
+    """{k: run folder} of a stage and method in ascending order, each from the first root that has it."""
+    found = {}
+    for root in reversed(roots):
+        found |= {int(path.name[4:]): path for path in run_folder(root, stage, method).parent.glob("seed*")
+                  if re.fullmatch(r"seed\d+", path.name)}
+    return dict(sorted(found.items()))
+
+
+def remedy(cfg: Stage, folder: Path, extra: str = "") -> str:
+    """What to do about a run folder: run python 0N_name.py preset [--method m] [--seed k] [--out root]."""
+    if not folder.is_relative_to(cfg.own):
+        return f"--weights {cfg.weights} is not, or no longer, the folder of a finished study"
+    stage, *method, seed = folder.relative_to(cfg.own).parts
+    options = {"method": method[0] if method else "", "seed": int(seed[4:]), "out": cfg.out if cfg.out != Stage.out else ""}
+    words = "".join(f" --{name} {value}" for name, value in options.items() if value)
+    return f"run python {stage}.py {cfg.preset}{words}{extra}"
+
+
+def record_of(cfg: Stage, folder: Path) -> dict | None:
+    """config.json of a run folder, None if there is none."""
+    return load_json(folder / "config.json", remedy(cfg, folder, " --force"))
+
+
+def find(cfg: Stage, stage: str, name: str, method: str | None = None, seed: int = 0) -> Path:
+    """Path of an earlier stage's artifact, in the first of cfg.roots that has it: finished, whole, and not stale.
+
+    Above 64 MiB only its size is looked at.
+
+    Raises:
+        Missing: it was not made, or its run is not finished.
+        UserError: it is damaged or stale.
+    """
+    own, *elsewhere = (run_folder(root, stage, method, seed) for root in reversed(cfg.roots))
+    records = {folder: record_of(cfg, folder) for folder in (*elsewhere, own)}
+    finished = [folder for folder, record in records.items() if record and record["finished"]]
+    folder = next((folder for folder in finished if (folder / name).exists()), own)
+    if folder not in finished:
+        if cfg.preset == "pretrained":  # which has no stages that could be run
+            own, elsewhere = elsewhere[0], []
+        state = ("unfinished" if records[own] else "missing") + f" (and not in --weights {cfg.weights})" * bool(elsewhere)
+        raise Missing(f"{own / name} is {state}: {remedy(cfg, own, ' first')}")
+    check_fresh(cfg, folder, records[folder])
+    path, size = folder / name, made(cfg, folder / name).get("bytes")
+    whole = path.exists() and path.stat().st_size == size
+    if not whole or (size <= 64 * 2**20 and digest(path) != made(cfg, path)):
+        raise UserError(f"{path} is missing or damaged: {remedy(cfg, folder, ' --force')}")
+    return path
+
+
+def plain(value):
+    """A value as JSON holds it."""
+    return json.loads(json.dumps(value, default=str))
+
+
+def made(cfg: Stage, path: Path) -> dict:
+    """sha256 and bytes of an artifact as its run recorded them, {} where it did not."""
+    return ((record_of(cfg, path.parent) or {}).get("outputs") or {}).get(path.name, {})
+
+
+def key_of(cfg: Stage, path: Path) -> tuple[Path, str]:
+    """The root that an artifact lies in, and its path below: <stage>/[method/]seed<k>/<name>."""
+    return next((root, path.relative_to(root).as_posix()) for root in cfg.roots if path.is_relative_to(root))
+
+
+def check_fresh(cfg: Stage, folder: Path, record: dict):
+    """UserError if an input of this run, or of a run before it, is another now; one that was deleted is no matter."""
+    roots = cfg.roots if folder.is_relative_to(cfg.own) else [cfg.weights]  # a study from elsewhere is whole in itself
+    for key, sha in record["inputs"].items():
+        path = next((root / key for root in roots if (root / key).with_name("config.json").exists()), None)
+        if path:
+            check_fresh(cfg, path.parent, record_of(cfg, path.parent))
+            if made(cfg, path).get("sha256") != sha:
+                raise UserError(f"{folder} is stale, its input {key} changed: {remedy(cfg, folder, ' --force')}")
+
+
+def lock(folder: Path):
+    """Holds a run folder for this process until it ends, without writing anything. UserError if another process has it."""
+    if folder not in _locks:
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(f"{folder}: another process is at work here; wait, or use another --seed or --out") from None
+        _locks[folder] = descriptor
+
+
+class Run:
+    """One run folder: begun, gone on with, or found finished. Other settings or inputs than its own are an error.
+
+    Args:
+        inputs: paths of what the run reads, by any name.
+        reads: names of the settings that it reads; none: all of the script's own. No other is recorded or compared.
+        grows: inputs may come and change: then a finished run is open again.
+    """
+
+    def __init__(self, cfg: Stage, stage: str, inputs: dict[str, Path] = {}, method=None, reads=None, grows=False):
+        self.cfg, self.dir = cfg, run_folder(cfg.own, stage, method, cfg.seed)
+        self.began, self.minutes_before, self.logged, self.columns = time.monotonic(), 0.0, 0, []
+        words = [re.sub(r"(^|=)[/~].*/(?=.)", r"\1", word) for word in sys.argv]  # absolute paths lose their folder
+        shared = {field.name for field in fields(Stage)} - {"seed"} | {*cfg.free}
+        self.settings = [field for field in fields(cfg) if field.name not in shared and (
+            reads is None or field.name in {"seed", *reads})]
+        sources = {key: root for root, key in (key_of(cfg, path) for path in inputs.values())}
+        self.record = {
+            "command": " ".join(["python", Path(words[0]).name, *words[1:]]),
+            "versions": {"python": sys.version.split()[0]} | {name: version(name) for name in VERSIONS},
+            "settings": {field.name: plain(getattr(cfg, field.name)) for field in self.settings},
+            "inputs": {key: made(cfg, root / key)["sha256"] for key, root in sources.items()},
+        }
+        try:
+            self.dir.mkdir(parents=True, exist_ok=True)
+        except OSError as failure:
+            raise UserError(f"--out {cfg.out}: cannot make {self.dir} ({failure.strerror})") from None
+        lock(self.dir.resolve())
+        if cfg.force:
+            for path in self.dir.iterdir():
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        before = record_of(cfg, self.dir) or {**self.record, "outputs": {}, "finished": False}
+        self.compare(before, grows)
+        self.finished = before["finished"] and before["inputs"] == self.record["inputs"]
+        self.record = before | {"inputs": self.record["inputs"], "finished": self.finished}
+        save_json(self.dir / "config.json", self.record)
+        if cfg.weights and not self.finished:
+            for root in cfg.roots:
+                if found := sorted({Path(key).parent.as_posix() for key, source in sources.items() if source == root}):
+                    print(f"from {root}: {', '.join(found)}")
+
+    def compare(self, before: dict, grows: bool):
+        """UserError where the run was begun otherwise; a setting that it does not know has the value it had then."""
+        old, new, changed = before["settings"], self.record["settings"], {"settings": [], "inputs": []}
+        for field in self.settings:
+            past = old.get(field.metadata.get("was"), plain(field.metadata.get("before", field.default)))
+            if (past := old.get(field.name, past)) != new[field.name]:
+                changed["settings"].append(f"{field.name} {past} -> {new[field.name]}")
+        known = {name for field in fields(self.cfg) for name in (field.name, field.metadata.get("was"))}
+        changed["settings"] += [f"{name} is not known here" for name in old if name not in known]
+        if not grows:
+            old, new = before["inputs"], self.record["inputs"]
+            changed["inputs"] = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+        for part, words in changed.items():
+            if words:
+                raise UserError(f"{self.dir}: {part} changed since it was begun ({', '.join(words)}): "
+                                "use --force, or another --out")
+
+    def skip(self) -> bool:
+        """True, said aloud, if there is nothing to do."""
+        if self.finished:
+            print(f"{self.dir}: finished already (--force redoes it)")
+        return self.finished
+
+    def log(self, **row):
+        """Appends a row to metrics.csv. The first row names the columns; a later one may leave some empty, and adds none."""
+        self.columns = self.columns or list(row)
+        with open(self.dir / "metrics.csv", "a" if self.logged else "w") as file:
+            writer = csv.DictWriter(file, self.columns, extrasaction="ignore", lineterminator="\n")
+            if not self.logged:
+                writer.writeheader()
+            writer.writerow({key: x if isinstance(x, (int, str)) else f"{float(x):.6g}" for key, x in row.items()})
+        self.logged += 1
+
+    def rows(self) -> list[dict]:
+        """metrics.csv read back: floats, nan where empty, and strings."""
+        path = self.dir / "metrics.csv"
+        rows = list(csv.DictReader(path.read_text().splitlines())) if path.exists() else []
+        for row in rows:
+            for key, text in row.items():
+                with contextlib.suppress(ValueError):
+                    row[key] = float(text or "nan")
+        return rows
+
+    def save_resume(self, state: dict):
+        """Writes a resume point: tensors, plain numbers and strings in lists and dicts (no numpy)."""
+        file = io.BytesIO()
+        torch.save({"state": state, "rows": self.logged, "minutes": self.minutes()}, file)
+        write_atomic(self.dir / "resume.pt", lambda temporary: temporary.write_bytes(file.getbuffer()))
+
+    def load_resume(self) -> dict | None:
+        """The last resume point, None to begin. Rows logged after it are dropped: they will be logged again."""
+        path, metrics = self.dir / "resume.pt", self.dir / "metrics.csv"
+        if not path.exists():
+            return metrics.unlink(missing_ok=True)
+        try:
+            saved = torch.load(path, map_location="cpu", weights_only=True)
+            self.logged, self.minutes_before = saved["rows"], saved["minutes"]
+            lines = metrics.read_text().splitlines(keepends=True)[: 1 + self.logged] if self.logged else []
+        except Exception:  # whatever torch meets in a damaged file
+            raise UserError(f"{path} is damaged: delete it, or use --force, to begin again") from None
+        self.columns = next(csv.reader(lines), [])
+        if lines:
+            write_atomic(metrics, lambda temporary: temporary.write_text("".join(lines)))
+        return saved["state"]
+
+    def minutes(self) -> float:
+        """Minutes spent on this run, those before the last resume point included."""
+        return self.minutes_before + (time.monotonic() - self.began) / 60
+
+    def out_of_time(self) -> bool:
+        return (time.monotonic() - _STARTED) / 60 >= self.cfg.max_minutes  # of the command, whatever it runs in turn
+
+    def stop(self):
+        print(f"{self.dir}: stopped after {self.minutes():.1f} minutes; the same command, without --force, goes on")
+
+    def finish(self, outputs: list[str], **extra):
+        """Records the artifacts, named relative to the folder, and marks the run finished."""
+        self.record["outputs"] = {name: digest(self.dir / name) for name in outputs}
+        self.record |= {"minutes": round(self.minutes(), 2), **extra, "finished": True}
+        save_json(self.dir / "config.json", self.record)
+        (self.dir / "resume.pt").unlink(missing_ok=True)
+        self.finished = True

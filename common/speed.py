@@ -1,0 +1,115 @@
+"""Speed, apart from the mathematics: every trick here gives what its plain form gives, sooner (tests/test_speed.py)."""
+import contextlib
+import ctypes
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+WIDTH = 16  # sequences side by side in PPO are a multiple of it: at 149, a prime, oneDNN's LSTM takes 3 times as long as at 144
+
+
+one_thread = {"initializer": torch.set_num_threads, "initargs": (1,)}  # OpenMP keeps its number per thread
+threads = ThreadPoolExecutor(2, **one_thread)  # runs independent jobs side by side; a job must not wait for another
+
+
+def set_up(pool=2):
+    """Makes the process a stage's: one thread inside an operation, `pool` threads above it, freed memory kept.
+
+    Two threads inside an operation wait for each other at each, and for any other job of the machine: 30 times slower on a busy
+    one. And a training frees and takes arrays of the same sizes all the time, for which the kernel would zero every page anew,
+    a fifth of PPO's time: where the C library is glibc they stay with the process (of a thread: blocks below 64 MB).
+    """
+    global threads
+    torch.set_num_threads(1)
+    threads = ThreadPoolExecutor(pool, **one_thread)
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(-4, 0), mallopt(-1, -1)  # M_MMAP_MAX: no mappings of single arrays; M_TRIM_THRESHOLD: no return of the rest
+
+
+def side_by_side(function, *arguments):
+    """list(map(function, *arguments)), in the pool's threads."""
+    return list(threads.map(function, *arguments))
+
+
+def autocast(device):
+    """bfloat16 autocast on a CPU that computes in it, else float32: CUDA's runs an LSTM in float16, too coarse for PPO."""
+    device = torch.device(device)
+    return _bfloat16(device, device.type == "cpu" and torch.cpu._is_avx512_bf16_supported())
+
+
+def _bfloat16(device, enabled):
+    """Autocast without its cache of weights, which would share their graph between threads."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=enabled, cache_enabled=False)
+
+
+def dropout(x, p, generator=None):
+    """F.dropout with a random byte an element: six times as fast on a CPU, where the masks cost more than the layers.
+
+    p in [0, 1) is rounded to whole 256ths.
+    """
+    drop = min(round(256 * p), 255)
+    if drop == 0:
+        return x
+    draws = torch.empty((x.numel() + 7) // 8, dtype=torch.int64, device=x.device).random_(-2**63, None, generator=generator)
+    keep = draws.view(torch.int8)[:x.numel()].view(x.shape).clamp_(drop - 129, drop - 128).sub_(drop - 129)  # 0 or 1
+    return x * keep * (256 / (256 - drop))
+
+
+class EvenLSTM(nn.LSTM):
+    """An LSTM that gives odd inputs one more, always zero: oneDNN's matrix units take even widths only, three times as fast."""
+
+    def __init__(self, inputs, size):
+        super().__init__(inputs + inputs % 2, size)
+        self.odd = inputs % 2
+
+    def forward(self, x, hidden=None):
+        return super().forward(F.pad(x, (0, self.odd)), hidden)
+
+
+def passes(head, z, count):
+    """`count` calls of head(z, generator), each with draws of its own, stacked: outputs (count, *z.shape[:-1], .).
+
+    Several calls at a time, as one on the expanded z: as many as the memory allows, and on a CPU at least two parts, in two
+    threads. The draws are the same for any number of threads.
+    """
+    at_once = min(max(1, 2**15 // z[..., 0].numel()), (count + 1) // 2)
+    counts = [min(at_once, count - i) for i in range(0, count, at_once)]
+    seeds, graph = torch.randint(2**62, (len(counts),)).tolist(), torch.is_grad_enabled()
+
+    def several(part, seed):  # in a thread that knows no autocast or no_grad of ours
+        with torch.set_grad_enabled(graph), _bfloat16(z.device, z.dtype == torch.bfloat16):
+            return head(z.expand(part, *z.shape), torch.Generator(z.device).manual_seed(seed))
+
+    outputs = (side_by_side if z.device.type == "cpu" else map)(several, counts, seeds)
+    return [None if parts[0] is None else torch.cat(parts) for parts in zip(*outputs)]
+
+
+def halves(batch):
+    """A padded batch (T, B, .), its mask (T, B) last, in two for two threads, each as long as its longest trajectory.
+
+    On a GPU, or with one trajectory, it stays whole.
+    """
+    if batch[0].is_cuda or batch[0].shape[1] == 1:
+        return [batch]
+    parts = [[x[:, i::2] for x in batch] for i in range(2)]
+    return [[x[:int(part[-1].sum(0).max())].contiguous() for x in part] for part in parts]
+
+
+def set_gradient(loss, batch, seeds, usual, parameters):
+    """Sets the gradient of (sum of the loss over the valid steps) / usual, from the halves of a batch, each in a thread.
+
+    loss(*batch, generator) is a mean over the valid steps and needs every parameter; `seeds` yields each half's seed.
+    Returns the losses and the numbers of valid steps of the halves.
+    """
+    def descent(part, seed):
+        value, steps = loss(*part, torch.Generator(part[0].device).manual_seed(seed)), part[-1].sum().item()
+        return value.item(), steps, torch.autograd.grad(value * (steps / usual), parameters)
+
+    parts = halves(batch)
+    values, steps, gradients = zip(*side_by_side(descent, parts, [next(seeds) for _ in parts]))
+    for parameter, *shares in zip(parameters, *gradients):
+        parameter.grad = sum(shares)
+    return values, steps

@@ -1,0 +1,87 @@
+"""The numbers of sec. 5 and 6 from what was measured: rates with intervals, paired differences, errors."""
+import math
+
+import numpy as np
+
+from common import task
+
+Z = 1.959964  # 95 % of a normal distribution
+ERRORS = ("trans_mean_l2_mm", "trans_rmse_mm", "rot_mean_abs_deg", "rot_rmse_deg")
+
+
+def wilson(values):
+    """Success rate of 0s and 1s with its 95 % Wilson interval."""
+    n, p = len(values), float(np.mean(values))
+    center, half = p + Z**2 / (2 * n), Z * math.sqrt(p * (1 - p) / n + Z**2 / (4 * n**2))
+    low, high = ((center + side * half) / (1 + Z**2 / n) for side in (-1, 1))
+    return {"mean": p, "low": min(p, max(0.0, low)), "high": max(p, min(1.0, high)), "episodes": n}  # rounding: p = 0, 1
+
+
+def paired(values, reference):
+    """Mean difference over the same episodes with its 95 % interval."""
+    d = np.subtract(values, reference, dtype=float)
+    mean, half = float(d.mean()), Z * float(d.std()) / math.sqrt(len(d))
+    return {"mean": mean, "low": mean - half, "high": mean + half}
+
+
+def errors(sums):
+    """Row of tab. estimator_ablation from sums (5, N) of trajectories.pose_errors: ERRORS in mm and degrees, and half_95."""
+    unit = np.array([1e3, 1e3 / math.sqrt(2), np.rad2deg(1), np.rad2deg(1)])  # the paper's RMSE in mm is per axis
+    steps = max(sums[0].sum(), 1)
+    mean = sums[1:].sum(1) / steps
+    half = Z * np.linalg.norm(sums[1:] - mean[:, None] * sums[0], axis=1) / steps  # only trajectories are independent
+    mean[[1, 3]] **= 0.5
+    half[[1, 3]] /= np.maximum(2 * mean[[1, 3]], 1e-12)
+    return dict(zip(ERRORS, (unit * mean).tolist())) | {"half_95": dict(zip(ERRORS, (unit * half).tolist()))}
+
+
+def error_table(sums):
+    """`errors` over all steps and, below "seen" and "occluded", over those."""
+    return errors(sums["all"]) | {name: errors(sums[name]) for name in ("seen", "occluded")}
+
+
+def spread(values):
+    return {"mean": float(np.mean(values)), "std": float(np.std(values))}
+
+
+def summarise(done):
+    """results.json from {section/key/...: one number an episode, or an error table}, as 05 measures them."""
+    results = {}
+    kinds = {"estimator_ablation": dict, "success_rate": list, "contact_switches": lambda v: spread(v) | {"episodes": len(v)}}
+    for name, values in done.items():
+        *keys, last = name.split("/")
+        rows = results
+        for key in keys:
+            rows = rows.setdefault(key, {})
+        rows[last] = kinds.get(keys[0], wilson)(values)
+    vision = results["estimator_ablation"]["vision"]
+    for row in results["estimator_ablation"].values():
+        row |= {f"{key}_of_vision": row[key] / vision[key] for key in (ERRORS[0], ERRORS[2])}
+    results["occlusion_loss"] = {method: paired(*(done[f"occlusion_duration/{method}/{name}"] for name in ("0", "full")))
+                                 for method in results.setdefault("occlusion_duration", {})}
+    reference = done.get("success_rate/est_uncertainty/0")
+    for method, by_seed in results["success_rate"].items():
+        row = results["success_rate"][method] = wilson(by_seed["0"])
+        if reference and method != "est_uncertainty":
+            row["minus_est_uncertainty"] = paired(by_seed["0"], reference)
+        if len(by_seed) > 1:
+            row["seeds"] = spread([np.mean(values) for values in by_seed.values()]) | {"count": len(by_seed)}
+    return results
+
+
+def robot_runs(logs):
+    """summary.json from {scenario: {run: log}}: successes with their interval, occlusion, times of the ticks, stops."""
+    summary = {}
+    for scenario, runs in logs.items():
+        if runs:
+            ended = [str(log["ended"]) for log in runs.values()]
+            won = [end.startswith("success") for end in ended]
+            rate = wilson(won)
+            age, busy = (np.concatenate([log.get(key, []) for log in runs.values()]) for key in ("age", "busy"))
+            p50, p99 = (1e3 * np.percentile(busy, (50, 99))).tolist() if busy.size else (None, None)
+            summary[scenario] = {
+                "successes": sum(won), "runs": len(won), "low": rate["low"], "high": rate["high"],
+                "by_estimate": any("estimate" in end for end in ended),
+                "occluded_share": float((age > 0).mean()) if busy.size else None, "tick_p50_ms": p50, "tick_p99_ms": p99,
+                "missed": int((busy > 1 / task.RATE).sum()), "stops": ended.count("stopped")}
+    return summary

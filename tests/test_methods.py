@@ -1,0 +1,82 @@
+"""One registry: a method is one entry; 05 measures what is trained, and nothing twice."""
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+ENTRY = """if True:
+    import runpy, sys
+    from common import stacks
+    stacks.METHODS["mine"] = stacks.Method("my own", "s_hat, sigma", "likelihood", "rl")
+    sys.argv[:] = sys.argv[1:]
+    runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+@pytest.fixture
+def extended(tmp_path):
+    """Runs a script of a house with one more method; returns what it printed."""
+    def of(script, *args):
+        command = [sys.executable, "-c", ENTRY, str(ROOT / f"{script}.py"), "smoke", "--out", "runs", "--device", "cpu", *args]
+        end = subprocess.run(command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
+        assert end.returncode == 0, end.stderr
+        return end.stdout
+    return of
+
+
+def test_a_method_is_one_entry_and_05_measures_only_what_is_new(study, extended, tmp_path):
+    own, results = tmp_path / "runs/smoke", tmp_path / "runs/smoke/05_evaluate/seed0/results.json"
+    for stage in ("01_train_privileged", "02_collect", "03_train_estimator", "05_evaluate"):
+        shutil.copytree(study / "smoke" / stage, own / stage)
+    for method in ("est_uncertainty", "end_to_end"):
+        shutil.copytree(study / "smoke/04_train_policy" / method, own / "04_train_policy" / method)
+    kept = json.loads((results.parent / "measurements.json").read_text())
+    kept["success_rate/end_to_end/0"][1] = [1] * 16  # a number that no measurement would give
+    (results.parent / "measurements.json").write_text(json.dumps(kept))
+
+    assert "mine" in extended("04_train_policy", "--method", "mine")
+    assert json.loads((own / "04_train_policy/mine/seed0/config.json").read_text())["inputs"].keys() >= {
+        "03_train_estimator/likelihood/seed0/estimator.safetensors"}
+    stdout = extended("05_evaluate")
+    assert "left out, as not trained: est; est_mse; behavior_cloning\n" in stdout
+    table = json.loads(results.read_text())
+    assert table["success_rate"].keys() == {"est_uncertainty", "end_to_end", "mine", "priv_on_estimate", "priv_on_state"}
+    assert table["occlusion_duration"].keys() == table["success_rate"].keys() - {"priv_on_state"}
+    assert table["success_rate"]["end_to_end"]["mean"] == 1, "measured again"
+    assert "| mine " in (results.parent / "tables.md").read_text() and "success of mine" not in stdout
+    assert "finished already" in extended("05_evaluate")
+
+    shutil.copytree(own / "04_train_policy/mine/seed0", own / "04_train_policy/mine/seed7")
+    shutil.copytree(study / "smoke/04_train_policy/est", own / "04_train_policy/est")
+    before = json.loads((results.parent / "measurements.json").read_text())
+    assert "left out, as not trained: est_mse; behavior_cloning\n" in extended("05_evaluate")
+    after = json.loads((results.parent / "measurements.json").read_text())
+    assert after.keys() - before.keys() == {"success_rate/mine/7", "success_rate/est/0", *(
+        f"occlusion_duration/est/{seconds}" for seconds in ("0", "2.5", "5", "10", "full"))}
+    assert json.loads(results.read_text())["success_rate"]["mine"]["seeds"]["count"] == 2
+
+
+def test_05_measures_pi_priv_alone_where_nothing_else_is_trained(study, extended, tmp_path):
+    for stage in ("01_train_privileged", "02_collect"):
+        shutil.copytree(study / "smoke" / stage, tmp_path / "runs/smoke" / stage)
+    stdout = extended("05_evaluate")
+    assert "left out, as not trained: estimator mse; estimator likelihood; estimator ours; est_uncertainty; est" in stdout
+    assert json.loads((tmp_path / "runs/smoke/05_evaluate/seed0/results.json").read_text())["success_rate"].keys() == {
+        "priv_on_state"}
+
+
+def test_a_further_seed_on_the_published_nets_stands_beside_them(study, extended, tmp_path):
+    published = tmp_path / "published"
+    shutil.copytree(study / "smoke", published, ignore=shutil.ignore_patterns("05_*", "06_*", "train_*", "validation_*"))
+    stdout = extended("04_train_policy", "--method", "est", "--seed", "3", "--weights", "published")
+    assert "from published: 01_train_privileged/seed0, 03_train_estimator/ours/seed0\n" in stdout
+    assert [path.name for path in (tmp_path / "runs/smoke").iterdir()] == ["04_train_policy"]
+    stdout = extended("05_evaluate", "--weights", "published")
+    assert "from runs/smoke: 04_train_policy/est/seed3\n" in stdout and "est/seed0" in stdout
+    results = json.loads((tmp_path / "runs/smoke/05_evaluate/seed0/results.json").read_text())
+    assert results["success_rate"]["est"]["seeds"]["count"] == 2

@@ -1,0 +1,42 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from common import training
+
+
+@pytest.mark.parametrize("tolerance, ended, successes, wanted", [
+    (4.0, 511, 511, (4.0, 511, 511)),  # too few to tell: they go on being counted
+    (4.0, 512, 512, (3.8, 0, 0)),
+    (4.0, 1000, 601, (3.8, 0, 0)),
+    (4.0, 1000, 600, (4.0, 0, 0)),  # not more than 60 %
+    (2.0, 513, 0, (2.0, 0, 0)),
+    (1.01, 512, 512, (1.0, 0, 0)),  # never below the task's own
+    (1.0, 512, 512, (1.0, 0, 0)),
+])
+def test_the_tolerance_is_lowered_as_episodes_succeed(tolerance, ended, successes, wanted):
+    assert training.lowered(tolerance, ended, successes) == pytest.approx(wanted)
+
+
+def batch(reward, done, successes):
+    """What training.ended_episodes reads of a rollout: (T, N) each."""
+    done = torch.tensor(done).bool()
+    return {"reward": torch.tensor(reward), "done": done, "success": (int(done.sum()), successes)}
+
+
+def test_episodes_are_counted_across_rollouts():
+    running = np.zeros((2, 2))
+    first = training.ended_episodes(batch([[1.0, 10.0], [2.0, 20.0]], [[0, 0], [1, 0]], 1), running)
+    assert first == {"train_success": 1, "train_return": 1 + 2, "train_length": 2}
+    assert running.tolist() == [[0, 10 + 20], [0, 2]]
+    second = training.ended_episodes(batch([[4.0, 40.0], [5.0, 50.0], [6.0, 60.0]], [[1, 1], [0, 0], [0, 1]], 1), running)
+    assert second == {"train_success": pytest.approx(1 / 3), "train_return": (4 + (10 + 20 + 40) + (50 + 60)) / 3,
+                      "train_length": (1 + 3 + 2) / 3}
+    assert running.tolist() == [[5 + 6, 0], [2, 0]]
+    third = training.ended_episodes(batch([[7.0, 70.0]], [[0, 0]], 0), running)
+    assert all(map(math.isnan, third.values())) and third.keys() == first.keys()
+    assert running.tolist() == [[5 + 6 + 7, 70], [3, 1]]
+    fourth = training.ended_episodes(batch([[8.0, 80.0]], [[1, 0]], 0), running)
+    assert fourth == {"train_success": 0, "train_return": 5 + 6 + 7 + 8, "train_length": 4}
