@@ -11,7 +11,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ENTRY = """if True:
     import runpy, sys
-    from common import stacks
+    from common import stacks, task
+    task.HORIZON = 40  # for time
     stacks.METHODS["mine"] = stacks.Method("my own", "s_hat, sigma", "likelihood", "rl")
     sys.argv[:] = sys.argv[1:]
     runpy.run_path(sys.argv[0], run_name="__main__")
