@@ -51,7 +51,7 @@ def train(run, cfg, train_set, validation_set, device):
         first = torch.randint(min(STRIDE, len(o)), (), generator=generator, device=device)
         steps = slice(int(first), None, STRIDE)
         with speed.autocast(device):
-            q_hat, log_var = f.head(f.lstm(o)[0][steps], generator)
+            q_hat, log_var, _ = f(o, steps=steps, generator=generator)
         q, valid = s[steps, :, :4], mask[steps]
         return networks.nll(q_hat, log_var, q, valid) if f.likelihood else networks.mse(q_hat, q, valid)
 
@@ -63,11 +63,10 @@ def train(run, cfg, train_set, validation_set, device):
 
 def error_against_passes(estimator, data, cfg, device):
     """Errors on the validation set for each M of GRID; without dropout for M = 1, as every pass is the same."""
-    def errors(m):
-        predict = trajectories.estimates(estimator, m)
-        return statistics.error_table(trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, predict))
+    def sums(m):
+        return trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, lambda o: estimator.predict(o, passes=m)[0])
 
-    return {m: errors(m) for m in (GRID if estimator.dropout else (1,))}
+    return {m: statistics.error_table(sums(m)) for m in (GRID if estimator.dropout else (1,))}
 
 
 def main(cfg):

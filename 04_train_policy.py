@@ -15,7 +15,7 @@ import torch
 from common import command, networks, plots, ppo, runs, speed, stacks, supervised, symmetry, training, trajectories, weights
 from common.files import UserError
 
-METHODS = {name: method for name, method in stacks.METHODS.items() if method.training != "pi_priv"}
+TRAINED = {name: method for name, method in stacks.METHODS.items() if method.training != "pi_priv"}
 
 
 @dataclass
@@ -40,7 +40,7 @@ class Cloned:
 
 @dataclass
 class Config(Cloned, Reinforced, command.Reader):
-    method: Literal[(*METHODS, "all")] = "all"  # which policy to train
+    method: Literal[(*TRAINED, "all")] = "all"  # which policy to train
 
 
 _QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy_coef=0.0005, kl_target=0.015,
@@ -58,10 +58,10 @@ PRESETS = {
 
 def settings_of(cfg):
     """Names of the settings that a method reads."""
-    if METHODS[cfg.method].training == "cloning":
+    if TRAINED[cfg.method].training == "cloning":
         return {"method", "sizes", "grad_norm", *(field.name for field in fields(Cloned))}
     reads = {"method", *(field.name for field in fields(Reinforced))}
-    return reads if METHODS[cfg.method].estimator else reads - {"passes"}
+    return reads if TRAINED[cfg.method].estimator else reads - {"passes"}
 
 
 def inputs_of(cfg):
@@ -72,13 +72,13 @@ def inputs_of(cfg):
     def nets(*names):
         return {name: runs.find(cfg, "01_train_privileged", f"{name}.safetensors") for name in names}
 
-    if METHODS[cfg.method].training == "cloning":
+    if TRAINED[cfg.method].training == "cloning":
         train, validation = (trajectories.load_set(cfg, f"teacher_{name}")[1] for name in ("train", "validation"))
         return nets("policy") | train | validation
     paths = nets("policy", "value") if cfg.warm_start else {}
     if cfg.warm_start and (sizes := weights.load(networks.Recurrent, paths["policy"]).sizes) != cfg.sizes:
         raise UserError(f"--sizes {cfg.sizes}: pi_priv has {sizes}; use those, or --no-warm-start")
-    if kind := METHODS[cfg.method].estimator:
+    if kind := TRAINED[cfg.method].estimator:
         paths["estimator"] = runs.find(cfg, "03_train_estimator", "estimator.safetensors", kind)
     return paths
 
@@ -93,16 +93,16 @@ def start_from(net, trained, first=0):
 
 def train_rl(run, cfg, paths, device):
     """Recurrent PPO on the method's stack (sec. 3.3). Returns the policy, None when the time limit stopped it."""
-    method = METHODS[cfg.method]
+    method = TRAINED[cfg.method]
     estimator = weights.load(networks.Estimator, paths["estimator"], device) if method.estimator else None
     env = stacks.make(method, cfg.num_envs, estimator, cfg.passes, privileged=cfg.privileged_critic)
     held_out = stacks.make(method, cfg.eval_episodes, estimator, cfg.passes)
     torch.manual_seed(cfg.seed)
-    known = env.single_observation_space.shape[0]
-    pi, critic = networks.policy(method.size, cfg.sizes).to(device), networks.value(known, cfg.sizes).to(device)
+    seen, known = (stack.single_observation_space.shape[0] for stack in (held_out, env))
+    pi, critic = networks.policy(seen, cfg.sizes).to(device), networks.value(known, cfg.sizes).to(device)
     if cfg.warm_start:
         start_from(pi, weights.load(networks.Recurrent, paths["policy"], device))
-        start_from(critic, weights.load(networks.Recurrent, paths["value"], device), method.size if cfg.privileged_critic else 0)
+        start_from(critic, weights.load(networks.Recurrent, paths["value"], device), seen if cfg.privileged_critic else 0)
     return pi if training.train(run, cfg, env, held_out, pi, critic) else None
 
 
@@ -110,7 +110,7 @@ def train_bc(run, cfg, paths, device):
     """Behaviour cloning of pi_priv on its own trajectories (appendix B.3): the student of the lowest validation loss."""
     teacher = weights.load(networks.Recurrent, paths["policy"], device)
     torch.manual_seed(cfg.seed)
-    student = networks.policy(METHODS[cfg.method].size, cfg.sizes).to(device)
+    student = networks.policy(9, cfg.sizes).to(device)
 
     def loss(o, s, mask, generator):
         """Sum over both velocities of the cross-entropy with the teacher's distribution."""
@@ -134,8 +134,8 @@ def train_bc(run, cfg, paths, device):
 
 def main(cfg):
     device = command.device_of(cfg)
-    for method in METHODS if cfg.method == "all" else [cfg.method]:
-        cfg, cloning = replace(cfg, method=method), METHODS[method].training == "cloning"
+    for method in TRAINED if cfg.method == "all" else [cfg.method]:
+        cfg, cloning = replace(cfg, method=method), TRAINED[method].training == "cloning"
         paths = inputs_of(cfg)
         run = runs.Run(cfg, "04_train_policy", paths, method, settings_of(cfg))
         if run.skip():

@@ -9,6 +9,7 @@ appendix: success_rate, occlusion_duration, trajectory_with_uncertainty, sim, su
 bc_loss. What is not trained is left out; after a further training the same command measures what is new, and no more
 (measurements.json). Resumes after the last finished measurement.
 """
+import hashlib
 import math
 from dataclasses import dataclass
 from functools import cache
@@ -80,7 +81,7 @@ def trained(cfg):
 
     Raises UserError: pi_priv is missing, or something is damaged or stale.
     """
-    runs.find(cfg, "01_train_privileged", "policy.safetensors")
+    pi_priv = runs.find(cfg, "01_train_privileged", "policy.safetensors")
     estimators, policies, left_out = {}, {}, []
     for kind in reversed(ESTIMATORS):  # the order of tab. estimator_ablation
         try:
@@ -90,13 +91,17 @@ def trained(cfg):
     for name, method in METHODS.items():
         stage, folder = ("01_train_privileged", None) if method.training == "pi_priv" else ("04_train_policy", name)
         for k in sorted({0, *runs.seeds(cfg.roots, stage, folder)}):
+            label = f"{name}, seed {k}" if k else name
             try:
                 path = runs.find(cfg, stage, "policy.safetensors", folder, k)
                 if method.estimator not in (None, *estimators) or k and (name, 0) not in policies:
                     raise runs.Missing
+                runs.check_lineage(cfg, path.parent, runs.inputs_of(cfg, [pi_priv, *estimators.values(), path]))
                 policies[name, k] = path
             except runs.Missing:
-                left_out.append(f"{name}, seed {k}" if k else name)
+                left_out.append(label)
+            except runs.Mixed:
+                left_out.append(f"{label} (on other nets than these)")
     return estimators, policies, left_out
 
 
@@ -139,7 +144,9 @@ class Players:
 
 def estimator_errors(cfg, players, test, kind):
     """Row of tab. estimator_ablation on the test set; vision is the pose in o, held when occluded."""
-    predict = trajectories.estimates(players.estimator(kind), cfg.test_passes) if kind != "vision" else lambda o: o[..., :4]
+    def predict(o):
+        return o[..., :4] if kind == "vision" else players.estimator(kind).predict(o, passes=cfg.test_passes)[0]
+
     torch.manual_seed(LIST + cfg.seed)
     return statistics.error_table(trajectories.measure(test, cfg.test, 100, LIST + cfg.seed, players.device, predict))
 
@@ -156,6 +163,8 @@ def report(run):
 def draw(run, players, results, done):
     """Every figure that the methods measured allow, and the film; returns which episodes they show."""
     cfg, shown = run.cfg, {}
+    for old in (*run.dir.glob("*.png"), *run.dir.glob("film.*")):
+        old.unlink()
     levels = {m: row["mean"] for m, row in results["success_rate"].items() if METHODS[m].training != "rl"}
     levels.pop("priv_on_state")
     plots.success_rate(cfg.roots, run.dir / "success_rate.png", levels)
@@ -193,29 +202,30 @@ def main(cfg):
     run = runs.Run(cfg, "05_evaluate", paths | test_paths, grows=True)
     if left_out:
         print(f"left out, as not trained: {'; '.join(left_out)}")
-    if run.finished:
+    players, todo = Players(cfg, paths, device), measurements(cfg, policies)
+    sha = {name: next(iter(runs.inputs_of(cfg, [path]).values())) for name, path in (paths | test_paths).items()}
+    sources = {f"estimator_ablation/{kind}": [*(sha[name] for name in test_paths), sha.get(kind)]
+               for kind in ("vision", *estimators)}
+    sources |= {name: [sha[m.method, m.seed], sha.get(METHODS[m.method].estimator)] for name, m in todo.items()}
+    keys = {name: f"{name} {hashlib.sha256(repr(files).encode()).hexdigest()[:16]}" for name, files in sources.items()}
+    kept = load_json(run.dir / "measurements.json", "delete it, and the same command measures anew") or {}
+    if run.finished and set(keys.values()) <= kept.keys() and (run.dir / "results.json").exists():
         report(run)
         return run.skip()
 
-    players, todo = Players(cfg, paths, device), measurements(cfg, policies)
-    sha = {name: run.record["inputs"][runs.key_of(cfg, path)[1]] for name, path in (paths | test_paths).items()}
-    tested = [sha[name] for name in test_paths]
-    sources = {f"estimator_ablation/{kind}": [*tested, sha.get(kind)] for kind in ("vision", *estimators)}  # what they come from
-    sources |= {name: [sha[m.method, m.seed], sha.get(METHODS[m.method].estimator)] for name, m in todo.items()}
-    kept = load_json(run.dir / "measurements.json", "delete it, and the same command measures anew") or {}
-    kept = {name: kept[name] for name in sources if name in kept and kept[name][0] == sources[name]}
     progress = bar(sum(m.episodes for m in todo.values()), "05_evaluate", unit="episode",
-                   initial=sum(m.episodes for name, m in todo.items() if name in kept))
-    for name in [name for name in sources if name not in kept]:
+                   initial=sum(m.episodes for name, m in todo.items() if keys[name] in kept))
+    for name, key in keys.items():
+        if key in kept:
+            continue
         if name in todo:
-            values = players.measure(todo[name], progress, name)
+            kept[key] = players.measure(todo[name], progress, name)
         else:
-            values = estimator_errors(cfg, players, test, name.partition("/")[2])
-        kept[name] = [sources[name], values]
+            kept[key] = estimator_errors(cfg, players, test, name.partition("/")[2])
         save_json(run.dir / "measurements.json", kept, indent=None)
         if run.out_of_time():
             return run.stop()
-    done = {name: kept[name][1] for name in sources}
+    done = {name: kept[key] for name, key in keys.items()}
     progress.close()
 
     results = statistics.summarise(done)

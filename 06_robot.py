@@ -198,6 +198,7 @@ def main(cfg):
     scenarios = SCENARIOS if cfg.scenario == "all" else (cfg.scenario,)
     if cfg.force and any(runlog.read(folder, other) for other in SCENARIOS if other not in scenarios):
         raise UserError(f"--force redoes all scenarios of {folder}: say --scenario all, or another --seed")
+    runs.claim(folder)  # before anything touches an arm that another process may drive
     arm = connect(cfg)
     run = runs.Run(cfg, "06_robot", paths)
     logs = {scenario: runlog.read(run.dir, scenario) for scenario in SCENARIOS}

@@ -70,6 +70,8 @@ def parse(config_class: type, presets: dict[str, dict], doc: str, args: list[str
         # tyro frames its message, with a rule below it and more help below that
         message = box.getvalue().partition("\n")[2].partition("│ ─")[0].replace("│", " ").strip().rstrip(".")
         raise UserError(f"{message}; see {script} {preset} --help") from None
+    if cfg.weights and not any(cfg.weights.glob("0*/**/config.json")):
+        raise UserError(f"--weights {cfg.weights}: no run is in there; say pretrained, or the runs/<preset> of a study")
     for name, value in vars(cfg).items():
         for number in value if isinstance(value, tuple) else [value]:
             least = int(type(number) is int and name != "seed")
@@ -93,9 +95,8 @@ def main(config_class: type, presets: dict[str, dict], run: Callable, doc: str):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except OSError as failure:
-        # numpy gives no errno where the disk is full
-        if failure.errno not in (None, errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST,
-                                 errno.ENOTDIR):
+        known = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR)
+        if failure.errno not in (None, *known):  # numpy gives no errno where the disk is full
             raise
         message, code = f"cannot read or write ({failure}): make room, or choose another --out", 2
     print("error:", " ".join(message.split()), file=sys.stderr)

@@ -6,7 +6,7 @@ from common import geometry, task
 
 VIEW = 1.1 * task.WORKSPACE[0]  # m, the width of a top view
 SQUARE = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
-TARGET, BOX, PUSHER, BORDER = (170, 205, 240), (30, 60, 130), (210, 40, 40), (150, 150, 150)  # RGB
+TARGET_COLOUR, BOX_COLOUR, PUSHER_COLOUR, BORDER_COLOUR = (170, 205, 240), (30, 60, 130), (210, 40, 40), (150, 150, 150)  # RGB
 
 
 def corners(pose):
@@ -33,9 +33,9 @@ def outline(image, pose, colour):
 def top_view(state, width=800):
     """Image (width / 2, width, 3) uint8 RGB of a state (7,): target light blue, box dark blue, pusher red (fig. sim)."""
     image = np.full((width // 2, width, 3), 255, np.uint8)
-    cv2.polylines(image, [pixels(SQUARE * task.HALF, width)], True, BORDER, 2, cv2.LINE_AA, 4)
-    cv2.fillPoly(image, [pixels(corners(np.zeros(3)), width)], TARGET, cv2.LINE_AA, 4)
-    cv2.fillPoly(image, [pixels(corners(state[:3]), width)], BOX, cv2.LINE_AA, 4)
+    cv2.polylines(image, [pixels(SQUARE * task.HALF, width)], True, BORDER_COLOUR, 2, cv2.LINE_AA, 4)
+    cv2.fillPoly(image, [pixels(corners(np.zeros(3)), width)], TARGET_COLOUR, cv2.LINE_AA, 4)
+    cv2.fillPoly(image, [pixels(corners(state[:3]), width)], BOX_COLOUR, cv2.LINE_AA, 4)
     cv2.line(image, *pixels(front(state[:3]), width).tolist(), (255, 255, 255), 2, cv2.LINE_AA, 4)
-    cv2.circle(image, pixels(state[3:5], width).tolist(), int(16 * task.RADIUS * width / VIEW), PUSHER, -1, cv2.LINE_AA, 4)
+    cv2.circle(image, pixels(state[3:5], width).tolist(), int(16 * task.RADIUS * width / VIEW), PUSHER_COLOUR, -1, cv2.LINE_AA, 4)
     return image

@@ -2,6 +2,8 @@
 
 Importing this module registers both as "Push-v0"; gymnasium.make("common.env:Push-v0") imports it by itself.
 """
+from operator import attrgetter
+
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -23,9 +25,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
     Infos: `state` (N, 7) true states in SI units and `success` (N,) of this step. Where an episode ended, `_final_obs` (N,)
     is set, `final_obs` (N, 8) and `final_state` (N, 7) hold its end, and observation and `state` start the next episode.
 
-    Args:
-        whole_workspace: draw the starts over the whole workspace instead of the study's region.
-        sub_steps: physics steps a control step.
+    Args: whole_workspace: draw the starts over all of it, not the study's region; sub_steps: physics steps a control step.
 
     Attributes:
         worlds: simulator.Worlds, the physics; its box, pusher, force, dynamics (here the drawn ones) and state are here too.
@@ -46,11 +46,12 @@ class PushVectorEnv(gym.vector.VectorEnv):
         self.worlds = Worlds(num_envs, sub_steps)
         self._steps = np.zeros(num_envs, int)
 
-    box, pusher, force, dynamics, state = (
-        property(lambda self, name=name: getattr(self.worlds, name)) for name in ("box", "pusher", "force", "dynamics", "state"))
+    box, pusher = property(attrgetter("worlds.box")), property(attrgetter("worlds.pusher"))
+    force, dynamics = property(attrgetter("worlds.force")), property(attrgetter("worlds.dynamics"))
+    state = property(attrgetter("worlds.state"))
 
     def _draw_start(self, count, box=None, pusher=None):
-        """Starts of the study around what is given; the aided ones: box nearer to the target, pusher within 3 cm of it."""
+        """Starts of the study around what is given; the curriculum's: box nearer to the target, pusher within 3 cm of it."""
         rng = self.np_random
         box_range = [*self._start_box, np.pi]
         near = rng.random(count) < self.near_share

@@ -13,9 +13,17 @@ class UserError(Exception):
     """A user's mistake: one line, what is wrong and what to do."""
 
 
+def make_folder(path: Path):
+    """Makes a folder and those above it. Raises UserError where it cannot."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as failure:
+        raise UserError(f"cannot make {path} ({failure.strerror}): choose another --out") from None
+
+
 def write_atomic(path: Path, write: Callable[[Path], object]):
     """Calls write with a temporary path beside `path`, of the same suffix, and renames the result to `path`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
     try:
         write(temporary)

@@ -47,7 +47,7 @@ def frame(state, o, belief, step):
     def text(words, x, y, colour=TEXT):
         cv2.putText(image, words, (x, WIDTH // 2 + y), cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA)
 
-    for x, words, colour in ((20, "true box", draw.BOX), (240, "target", draw.TARGET), (460, "observed", HELD),
+    for x, words, colour in ((20, "true box", draw.BOX_COLOUR), (240, "target", draw.TARGET_COLOUR), (460, "observed", HELD),
                              (680, "estimate, 2 sigma", ESTIMATE)):
         cv2.rectangle(image, (x, WIDTH // 2 + 10), (x + 24, WIDTH // 2 + 28), colour, -1)
         text(words, x + 34, 26)

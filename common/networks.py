@@ -95,10 +95,10 @@ class Estimator(nn.Module):
         q, log_var = z.float().split(4, -1) if self.likelihood else (z.float(), None)
         return q, log_var.clamp(*LOG_VAR) if self.likelihood else None
 
-    def forward(self, o, hidden=None):
-        """One stochastic pass: pose (T, B, 4), log-variances and the hidden state of observations (T, B, 9)."""
+    def forward(self, o, hidden=None, steps=slice(None), generator=None):
+        """One stochastic pass: pose (T, B, 4), log-variances at `steps`, and the hidden state of observations (T, B, 9)."""
         z, hidden = self.lstm(o, hidden)
-        return *self.head(z), hidden
+        return *self.head(z[steps], generator), hidden
 
     def predict(self, o, hidden=None, passes=50):
         """Predictive mean and total variance (T, B, 4) (eqs. 3, 4), and hidden state: LSTM once, head `passes` times."""

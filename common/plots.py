@@ -19,7 +19,7 @@ matplotlib.rcParams.update({
 
 # Okabe and Ito's colours, told apart by the colour-blind, in the order of the registry: the same in every figure
 COLOURS = ("#0072B2", "#56B4E9", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#444444", "#B8A100", "#7A4FBF", "#8C564B")
-SUCCESS = {"ylabel": "success rate (%)", "ylim": (-2, 102)}  # the y axis of success rates
+SUCCESS_AXIS = {"ylabel": "success rate (%)", "ylim": (-2, 102)}  # the y axis of success rates
 LOSSES = {  # figure: stage, methods, what is on the y axis
     "likelihood_loss": ("03_train_estimator", [m for m, kind in ESTIMATORS.items() if kind.likelihood], "loss (eq. 1)"),
     "mse_loss": ("03_train_estimator", [m for m, kind in ESTIMATORS.items() if not kind.likelihood], "mean squared error"),
@@ -63,7 +63,7 @@ def success_rate_priv(roots, path):
     """Fig. success_rate_priv: held-out success of pi_priv over training."""
     figure, ax = new(5, 3)
     band(ax, "priv_on_state", runs.seeds(roots, "01_train_privileged"), "steps", "success", 1e-6, 100)
-    ax.set(xlabel="environment steps (millions)", **SUCCESS)
+    ax.set(xlabel="environment steps (millions)", **SUCCESS_AXIS)
     ax.legend(handles=ax.lines, loc="lower right")
     write_atomic(path, figure.savefig)
 
@@ -94,7 +94,7 @@ def checkpoints(rows, path):
     figure, ax = new(5, 3)
     success = [100 * row["success"] for row in rows]
     ax.plot([row["checkpoint"] for row in rows], success, "o-", ms=3, color=style("priv_on_state")[1])
-    ax.set(xlabel=r"checkpoint of $\pi_{priv}$", xlim=(-0.5, len(rows) - 0.5), **SUCCESS)
+    ax.set(xlabel=r"checkpoint of $\pi_{priv}$", xlim=(-0.5, len(rows) - 0.5), **SUCCESS_AXIS)
     ax.set_title("actions sampled, study's starts")
     ax.xaxis.get_major_locator().set_params(integer=True)
     write_atomic(path, figure.savefig)
@@ -135,7 +135,7 @@ def success_rate(roots, path, levels={}):
         band(ax, method, runs.seeds(roots, "04_train_policy", method), "steps", "success", 1e-6, 100, zorder=2.9 - i / 10)
     for method, level in levels.items():
         ax.axhline(100 * level, color=style(method)[1], ls="--", lw=1.4, label=f"{style(method)[0]}, after training")
-    ax.set(xlabel="environment steps (millions)", **SUCCESS)
+    ax.set(xlabel="environment steps (millions)", **SUCCESS_AXIS)
     if ax.lines:  # an empty legend would take room
         figure.legend(loc="outside right upper")
     write_atomic(path, figure.savefig)
@@ -150,7 +150,7 @@ def occlusion_duration(results, path):
         x = np.arange(len(points)) + 0.05 * (i - (len(results) - 1) / 2)  # side by side, so that no bar hides another
         ax.errorbar(x, mean, (mean - low, high - mean), color=color, marker=marker, ms=5, capsize=2, elinewidth=1, label=name)
     ax.set_xticks(range(len(points)), [{"0": "none"}.get(key, key) for key in points])
-    ax.set(xlabel="occlusion duration (s)", title=f"{points['0']['episodes']:,} episodes a point, 95 % intervals", **SUCCESS)
+    ax.set(xlabel="occlusion duration (s)", title=f"{points['0']['episodes']:,} episodes a point, 95 % intervals", **SUCCESS_AXIS)
     figure.legend(loc="outside right upper")
     write_atomic(path, figure.savefig)
 

@@ -63,7 +63,7 @@ def rollout(env, actor, critic, carry, steps):
     for t in range(steps):
         b["obs"][t] = obs
         x = torch.as_tensor(obs, device=device)[None]
-        remembering = speed.threads.submit(see, critic, x, hidden_v)  # while the policy acts and the worlds move
+        remembering = speed.pool.submit(see, critic, x, hidden_v)  # while the policy acts and the worlds move
         logits, hidden_pi = see(actor, x[..., :actor.inputs], hidden_pi)
         action = sample(logits[0])
         actions.append(action)

@@ -20,7 +20,7 @@ from pathlib import Path
 import torch
 
 from common.command import Stage
-from common.files import UserError, digest, load_json, save_json, write_atomic
+from common.files import UserError, digest, load_json, make_folder, save_json, write_atomic
 
 VERSIONS = ("torch", "numpy", "pymunk", "gymnasium", "opencv-python-headless", "clarabel")
 _STARTED = time.monotonic()
@@ -29,6 +29,10 @@ _locks = {}  # folder -> descriptor that holds its lock for this process
 
 class Missing(UserError):
     """What an earlier stage has not made, or not finished."""
+
+
+class Mixed(UserError):
+    """Artifacts that do not belong together."""
 
 
 def run_folder(study: Path, stage: str, method: str | None = None, seed: int = 0) -> Path:
@@ -41,7 +45,7 @@ def seeds(roots: list[Path], stage: str, method: str | None = None) -> dict[int,
     found = {}
     for root in reversed(roots):
         found |= {int(path.name[4:]): path for path in run_folder(root, stage, method).parent.glob("seed*")
-                  if re.fullmatch(r"seed\d+", path.name)}
+                  if re.fullmatch(r"seed(0|[1-9]\d*)", path.name)}
     return dict(sorted(found.items()))
 
 
@@ -50,7 +54,8 @@ def remedy(cfg: Stage, folder: Path, extra: str = "") -> str:
     if not folder.is_relative_to(cfg.own):
         return f"--weights {cfg.weights} is not, or no longer, the folder of a finished study"
     stage, *method, seed = folder.relative_to(cfg.own).parts
-    options = {"method": method[0] if method else "", "seed": int(seed[4:]), "out": cfg.out if cfg.out != Stage.out else ""}
+    options = {"method": method[0] if method else "", "seed": int(seed[4:]), "out": cfg.out if cfg.out != Stage.out else "",
+               "weights": cfg.weights if stage[:2] in ("03", "04") else ""}
     words = "".join(f" --{name} {value}" for name, value in options.items() if value)
     return f"run python {stage}.py {cfg.preset}{words}{extra}"
 
@@ -63,64 +68,80 @@ def record_of(cfg: Stage, folder: Path) -> dict | None:
 def find(cfg: Stage, stage: str, name: str, method: str | None = None, seed: int = 0) -> Path:
     """Path of an earlier stage's artifact, in the first of cfg.roots that has it: finished, whole, and not stale.
 
-    Above 64 MiB only its size is looked at.
-
-    Raises:
-        Missing: it was not made, or its run is not finished.
-        UserError: it is damaged or stale.
+    Above 64 MiB only its size is looked at. Raises Missing: it was not made, or its run is not finished; UserError: it is
+    damaged or stale.
     """
-    own, *elsewhere = (run_folder(root, stage, method, seed) for root in reversed(cfg.roots))
-    records = {folder: record_of(cfg, folder) for folder in (*elsewhere, own)}
-    finished = [folder for folder, record in records.items() if record and record["finished"]]
-    folder = next((folder for folder in finished if (folder / name).exists()), own)
-    if folder not in finished:
-        if cfg.preset == "pretrained":  # which has no stages that could be run
-            own, elsewhere = elsewhere[0], []
-        state = ("unfinished" if records[own] else "missing") + f" (and not in --weights {cfg.weights})" * bool(elsewhere)
+    places = [run_folder(root, stage, method, seed) for root in cfg.roots]
+    records = {folder: record_of(cfg, folder) for folder in places}
+    finished = [folder for folder in places if records[folder] and records[folder]["finished"]]
+    there, own = [folder for folder in finished if (folder / name).exists()], places[-1]
+    if not there and own not in finished:
+        if cfg.preset == "pretrained" and cfg.weights:  # a preset without stages that could be run
+            raise Missing(f"{places[0] / name} is missing: {remedy(cfg, places[0])}")
+        state = ("unfinished" if records[own] else "missing") + f" (and not in --weights {cfg.weights})" * bool(cfg.weights)
         raise Missing(f"{own / name} is {state}: {remedy(cfg, own, ' first')}")
-    check_fresh(cfg, folder, records[folder])
-    path, size = folder / name, made(cfg, folder / name).get("bytes")
-    whole = path.exists() and path.stat().st_size == size
-    if not whole or (size <= 64 * 2**20 and digest(path) != made(cfg, path)):
-        raise UserError(f"{path} is missing or damaged: {remedy(cfg, folder, ' --force')}")
+    path = (there or [own])[0] / name
+    record = records[path.parent]
+    check_lineage(cfg, path.parent, record["inputs"])
+    made = record["outputs"].get(name, {"bytes": -1})
+    whole = path.exists() and path.stat().st_size == made["bytes"]
+    if not whole or (made["bytes"] <= 64 * 2**20 and digest(path) != made):
+        raise UserError(f"{path} is missing or damaged: {remedy(cfg, path.parent, ' --force')}")
     return path
 
 
-def plain(value):
-    """A value as JSON holds it."""
-    return json.loads(json.dumps(value, default=str))
+def inputs_of(cfg: Stage, paths) -> dict[str, str]:
+    """{path below its root: recorded sha256} of artifacts."""
+    roots = {path: next(root for root in cfg.roots if path.is_relative_to(root)) for path in paths}
+    return {path.relative_to(root).as_posix(): record_of(cfg, path.parent)["outputs"][path.name]["sha256"]
+            for path, root in roots.items()}
 
 
-def made(cfg: Stage, path: Path) -> dict:
-    """sha256 and bytes of an artifact as its run recorded them, {} where it did not."""
-    return ((record_of(cfg, path.parent) or {}).get("outputs") or {}).get(path.name, {})
+def check_lineage(cfg: Stage, folder: Path, inputs: dict[str, str]):
+    """Follows the inputs {key: sha256} of a run back through the records of cfg.roots; what was deleted is no matter.
+
+    Raises Mixed: they were made from different runs of one folder, such as two pi_priv; UserError: one of them, or of what
+    it was made from, is another now.
+    """
+    known, todo = {}, [(folder, key, sha) for key, sha in inputs.items()]
+    while todo:
+        for user, key, sha in todo:
+            place, _, name = key.rpartition("/")
+            known.setdefault(place, {}).setdefault(name, set()).add(sha)
+        users, todo = {key.rpartition("/")[0]: (user, key) for user, key, _ in reversed(todo)}, []
+        for place, (user, key) in users.items():
+            records = {root / place: record for root in cfg.roots if (record := record_of(cfg, root / place))}
+            fits = {path: [{record["outputs"].get(name, {}).get("sha256")} >= shas for name, shas in known[place].items()]
+                    for path, record in records.items()}
+            if found := next((path for path, matches in fits.items() if all(matches)), None):
+                todo += [(found, key, sha) for key, sha in records[found]["inputs"].items()]
+            elif records and all(map(any, zip(*fits.values()))) or max(map(len, known[place].values())) > 1:
+                raise Mixed(f"{folder} would be made from two different {place}: call without --weights, or with another --out")
+            elif records:
+                raise UserError(f"{user} is stale, its input {key} changed: {remedy(cfg, user, ' --force')}")
 
 
-def key_of(cfg: Stage, path: Path) -> tuple[Path, str]:
-    """The root that an artifact lies in, and its path below: <stage>/[method/]seed<k>/<name>."""
-    return next((root, path.relative_to(root).as_posix()) for root in cfg.roots if path.is_relative_to(root))
-
-
-def check_fresh(cfg: Stage, folder: Path, record: dict):
-    """UserError if an input of this run, or of a run before it, is another now; one that was deleted is no matter."""
-    roots = cfg.roots if folder.is_relative_to(cfg.own) else [cfg.weights]  # a study from elsewhere is whole in itself
-    for key, sha in record["inputs"].items():
-        path = next((root / key for root in roots if (root / key).with_name("config.json").exists()), None)
-        if path:
-            check_fresh(cfg, path.parent, record_of(cfg, path.parent))
-            if made(cfg, path).get("sha256") != sha:
-                raise UserError(f"{folder} is stale, its input {key} changed: {remedy(cfg, folder, ' --force')}")
-
-
-def lock(folder: Path):
-    """Holds a run folder for this process until it ends, without writing anything. UserError if another process has it."""
-    if folder not in _locks:
+def claim(folder: Path):
+    """Makes a run folder, and holds it for this process until it ends or the run is finished. UserError if another has it."""
+    make_folder(folder)
+    if folder.resolve() not in _locks:
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise UserError(f"{folder}: another process is at work here; wait, or use another --seed or --out") from None
-        _locks[folder] = descriptor
+        _locks[folder.resolve()] = descriptor
+
+
+def release(folder: Path):
+    """Lets another process have the folder."""
+    if folder.resolve() in _locks:
+        os.close(_locks.pop(folder.resolve()))
+
+
+def as_json(value):
+    """A setting as config.json holds it."""
+    return json.loads(json.dumps(value, default=str))
 
 
 class Run:
@@ -139,36 +160,33 @@ class Run:
         shared = {field.name for field in fields(Stage)} - {"seed"} | {*cfg.free}
         self.settings = [field for field in fields(cfg) if field.name not in shared and (
             reads is None or field.name in {"seed", *reads})]
-        sources = {key: root for root, key in (key_of(cfg, path) for path in inputs.values())}
         self.record = {
             "command": " ".join(["python", Path(words[0]).name, *words[1:]]),
             "versions": {"python": sys.version.split()[0]} | {name: version(name) for name in VERSIONS},
-            "settings": {field.name: plain(getattr(cfg, field.name)) for field in self.settings},
-            "inputs": {key: made(cfg, root / key)["sha256"] for key, root in sources.items()},
+            "settings": {field.name: as_json(getattr(cfg, field.name)) for field in self.settings},
+            "inputs": inputs_of(cfg, inputs.values()),
         }
-        try:
-            self.dir.mkdir(parents=True, exist_ok=True)
-        except OSError as failure:
-            raise UserError(f"--out {cfg.out}: cannot make {self.dir} ({failure.strerror})") from None
-        lock(self.dir.resolve())
+        check_lineage(cfg, self.dir, self.record["inputs"])
+        claim(self.dir)
         if cfg.force:
             for path in self.dir.iterdir():
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         before = record_of(cfg, self.dir) or {**self.record, "outputs": {}, "finished": False}
         self.compare(before, grows)
         self.finished = before["finished"] and before["inputs"] == self.record["inputs"]
-        self.record = before | {"inputs": self.record["inputs"], "finished": self.finished}
+        self.record = before if self.finished or not grows else before | self.record | {
+            "settings": before["settings"], "finished": False}
         save_json(self.dir / "config.json", self.record)
-        if cfg.weights and not self.finished:
-            for root in cfg.roots:
-                if found := sorted({Path(key).parent.as_posix() for key, source in sources.items() if source == root}):
-                    print(f"from {root}: {', '.join(found)}")
+        for root in cfg.roots if cfg.weights and not self.finished else ():
+            folders = {path.parent.relative_to(root).as_posix() for path in inputs.values() if path.is_relative_to(root)}
+            if folders:
+                print(f"from {root}: {', '.join(sorted(folders))}")
 
     def compare(self, before: dict, grows: bool):
         """UserError where the run was begun otherwise; a setting that it does not know has the value it had then."""
         old, new, changed = before["settings"], self.record["settings"], {"settings": [], "inputs": []}
         for field in self.settings:
-            past = old.get(field.metadata.get("was"), plain(field.metadata.get("before", field.default)))
+            past = old.get(field.metadata.get("was"), as_json(field.metadata.get("before", field.default)))
             if (past := old.get(field.name, past)) != new[field.name]:
                 changed["settings"].append(f"{field.name} {past} -> {new[field.name]}")
         known = {name for field in fields(self.cfg) for name in (field.name, field.metadata.get("was"))}
@@ -178,13 +196,14 @@ class Run:
             changed["inputs"] = [key for key in {**old, **new} if old.get(key) != new.get(key)]
         for part, words in changed.items():
             if words:
-                raise UserError(f"{self.dir}: {part} changed since it was begun ({', '.join(words)}): "
-                                "use --force, or another --out")
+                advice = "use --force, or another --out" + ", or the --weights of before" * (part == "inputs")
+                raise UserError(f"{self.dir}: {part} changed since it was begun ({', '.join(words)}): {advice}")
 
     def skip(self) -> bool:
         """True, said aloud, if there is nothing to do."""
         if self.finished:
             print(f"{self.dir}: finished already (--force redoes it)")
+            release(self.dir)
         return self.finished
 
     def log(self, **row):
@@ -246,3 +265,4 @@ class Run:
         save_json(self.dir / "config.json", self.record)
         (self.dir / "resume.pt").unlink(missing_ok=True)
         self.finished = True
+        release(self.dir)

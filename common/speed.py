@@ -8,30 +8,29 @@ from torch import nn
 from torch.nn import functional as F
 
 WIDTH = 16  # sequences side by side in PPO are a multiple of it: at 149, a prime, oneDNN's LSTM takes 3 times as long as at 144
-
-
 one_thread = {"initializer": torch.set_num_threads, "initargs": (1,)}  # OpenMP keeps its number per thread
-threads = ThreadPoolExecutor(2, **one_thread)  # runs independent jobs side by side; a job must not wait for another
+pool = ThreadPoolExecutor(2, **one_thread)  # runs independent jobs side by side; a job must not wait for another
 
 
-def set_up(pool=2):
-    """Makes the process a stage's: one thread inside an operation, `pool` threads above it, freed memory kept.
+def set_up(threads=2):
+    """Makes the process a stage's: one thread inside an operation, `threads` above it, freed memory kept.
 
-    Two threads inside an operation wait for each other at each, and for any other job of the machine: 30 times slower on a busy
-    one. And a training frees and takes arrays of the same sizes all the time, for which the kernel would zero every page anew,
-    a fifth of PPO's time: where the C library is glibc they stay with the process (of a thread: blocks below 64 MB).
+    Two threads inside an operation wait for each other at each, and for any other job: 30 times slower on a busy machine. And
+    a training takes and frees arrays of the same sizes all the time, whose pages the kernel would zero anew, a fifth of PPO's
+    time: with glibc they stay, in one arena for all threads (in a thread's own none above 64 MB would).
     """
-    global threads
+    global pool
     torch.set_num_threads(1)
-    threads = ThreadPoolExecutor(pool, **one_thread)
+    pool = ThreadPoolExecutor(threads, **one_thread)
     with contextlib.suppress(AttributeError, OSError, TypeError):
         mallopt = ctypes.CDLL(None).mallopt
-        mallopt(-4, 0), mallopt(-1, -1)  # M_MMAP_MAX: no mappings of single arrays; M_TRIM_THRESHOLD: no return of the rest
+        for parameter, value in ((-8, 1), (-4, 0), (-1, -1)):  # M_ARENA_MAX, M_MMAP_MAX, M_TRIM_THRESHOLD
+            mallopt(parameter, value)
 
 
 def side_by_side(function, *arguments):
     """list(map(function, *arguments)), in the pool's threads."""
-    return list(threads.map(function, *arguments))
+    return list(pool.map(function, *arguments))
 
 
 def autocast(device):
@@ -46,10 +45,7 @@ def _bfloat16(device, enabled):
 
 
 def dropout(x, p, generator=None):
-    """F.dropout with a random byte an element: six times as fast on a CPU, where the masks cost more than the layers.
-
-    p in [0, 1) is rounded to whole 256ths.
-    """
+    """F.dropout, p rounded to 256ths, with a random byte an element: six times as fast on a CPU, where masks cost most."""
     drop = min(round(256 * p), 255)
     if drop == 0:
         return x
@@ -88,10 +84,7 @@ def passes(head, z, count):
 
 
 def halves(batch):
-    """A padded batch (T, B, .), its mask (T, B) last, in two for two threads, each as long as its longest trajectory.
-
-    On a GPU, or with one trajectory, it stays whole.
-    """
+    """A padded batch (T, B, .), its mask (T, B) last, in two halves, each cut to its longest; one alone, or a GPU's, whole."""
     if batch[0].is_cuda or batch[0].shape[1] == 1:
         return [batch]
     parts = [[x[:, i::2] for x in batch] for i in range(2)]

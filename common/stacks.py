@@ -33,10 +33,10 @@ class Method:
     estimator: str | None  # key of ESTIMATORS: the one in its loop
     training: Literal["pi_priv", "rl", "cloning"]  # pi_priv: the policy of 01, untouched; the others are trained by 04
 
-    @property
-    def size(self):
-        """Width of what the policy reads."""
-        return {"s": 8, "o": 9, "s_hat": 8, "s_hat, sigma": 12}[self.reads]
+    def __post_init__(self):
+        if (self.reads in ("s", "o")) != (self.estimator is None) or self.reads not in {
+                "pi_priv": ("s", "s_hat"), "cloning": ("o",), "rl": ("o", "s_hat", "s_hat, sigma")}[self.training]:
+            raise ValueError(f"{self}: no stack of these wrappers")
 
 
 ESTIMATORS = {
@@ -58,10 +58,8 @@ METHODS = {
 def make(method, num_envs, estimator=None, passes=1, occlusion=None, whole_workspace=False, privileged=False):
     """The vector env that a method's policy acts in.
 
-    Args:
-        estimator, passes: the estimator that the method names, and its M.
-        occlusion: as in observation.ObservationModel; none where the true state is read.
-        whole_workspace: as in PushVectorEnv; privileged: append the true state, see Privileged.
+    Args: estimator, passes: the one that the method names, and its M; occlusion: as in ObservationModel, none where the true
+    state is read; whole_workspace: as in PushVectorEnv; privileged: append the true state, see Privileged.
     """
     env = PushVectorEnv(num_envs, whole_workspace=whole_workspace)
     env = frame = Mirrored(env if method.reads == "s" else Observed(env, occlusion))

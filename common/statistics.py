@@ -46,7 +46,7 @@ def spread(values):
 
 def summarise(done):
     """results.json from {section/key/...: one number an episode, or an error table}, as 05 measures them."""
-    results = {}
+    results = {"occlusion_duration": {}}
     kinds = {"estimator_ablation": dict, "success_rate": list, "contact_switches": lambda v: spread(v) | {"episodes": len(v)}}
     for name, values in done.items():
         *keys, last = name.split("/")
@@ -58,7 +58,7 @@ def summarise(done):
     for row in results["estimator_ablation"].values():
         row |= {f"{key}_of_vision": row[key] / vision[key] for key in (ERRORS[0], ERRORS[2])}
     results["occlusion_loss"] = {method: paired(*(done[f"occlusion_duration/{method}/{name}"] for name in ("0", "full")))
-                                 for method in results.setdefault("occlusion_duration", {})}
+                                 for method in results["occlusion_duration"]}
     reference = done.get("success_rate/est_uncertainty/0")
     for method, by_seed in results["success_rate"].items():
         row = results["success_rate"][method] = wilson(by_seed["0"])

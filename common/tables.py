@@ -65,7 +65,8 @@ def success_rate(results):
         seeds = f"{s['mean']:.1%} +- {100 * s['std']:.1f} ({s['count']})" if s else ""
         rows.append([method, percent(r), points(difference, "+") if difference else "", seeds])
     header = ["method", "success [95 %]", "minus est_uncertainty, paired", "mean +- std (seeds)"]
-    return f"Success on the fixed list of {r['episodes']:,} episodes (sec. 5.2)\n\n" + aligned(header, rows)
+    episodes = results["success_rate"]["priv_on_state"]["episodes"]
+    return f"Success on the fixed list of {episodes:,} episodes (sec. 5.2)\n\n" + aligned(header, rows)
 
 
 def occlusion_duration(results):

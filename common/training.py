@@ -15,7 +15,7 @@ from common.progress import bar
 EPISODES, SHARE, FACTOR = 512, 0.6, 0.95
 CURRICULUM = ("tolerance", "episodes", "successes")  # its state, as `lowered` takes it
 STATS = ("train_success", "train_return", "train_length", "policy_loss", "clip_fraction", "kl", "entropy", "value_loss",
-         "explained", "lr", "steps_per_s")  # of an update, in metrics.csv; all but the last two are means
+         "explained", "lr", "steps_per_s")  # of an update, in metrics.csv
 
 
 def lowered(tolerance, ended, successes):
@@ -69,7 +69,7 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
     worlds, running = env.unwrapped, np.zeros((2, hp.num_envs))
     optimizers = [torch.optim.Adam(net.parameters(), lr=hp.lr, eps=1e-5) for net in (actor, critic)]
     kl_end = hp.kl_target if hp.kl_target_end is None else hp.kl_target_end
-    first, curriculum, stats, success = 0, (hp.tolerance, 0, 0), dict.fromkeys(STATS, math.nan), 0.0
+    first, curriculum, stats, success = 0, (hp.tolerance, 0, 0), dict.fromkeys(STATS, math.nan), math.nan
     if state := run.load_resume():
         first, curriculum = state["update"], tuple(state[name] for name in CURRICULUM)
         for part, saved in zip((actor, critic, *optimizers), (state["actor"], state["critic"], *state["optimizers"])):
@@ -85,7 +85,8 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
             run.log(**row, tolerance=curriculum[0], **stats)
         if k == hp.updates:
             return True
-        clock, worlds.tolerance, worlds.near_share = time.perf_counter(), curriculum[0], hp.near_share * (1 - k / hp.updates)
+        clock = time.perf_counter()
+        worlds.tolerance, worlds.near_share = curriculum[0], hp.near_share * (1 - k / hp.updates)
         if k % hp.resume_every == 0:  # all worlds start anew here, in an uninterrupted run too
             if k > first:
                 nets = dict(actor=actor.state_dict(), critic=critic.state_dict(), optimizers=[o.state_dict() for o in optimizers])
@@ -93,7 +94,8 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
                 if run.out_of_time():
                     run.stop()
                     return False
-            carry, running[:] = begin(env, actor, critic, hp.seed, k), 0
+            carry = begin(env, actor, critic, hp.seed, k)
+            running[:] = 0
         batch, carry = ppo.rollout(env, actor, critic, carry, hp.rollout_steps)
         kl_target = hp.kl_target + (kl_end - hp.kl_target) * k / hp.updates
         seq = ppo.sequences(batch, critic, hp.gamma, hp.lam)

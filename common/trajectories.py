@@ -83,20 +83,13 @@ def pose_errors(q_hat, q, occluded, mask):
     return {name: (terms * chosen).sum(1) for name, chosen in steps.items()}
 
 
-def estimates(estimator, passes):
-    """For `measure`: the predictive mean of an estimator (eq. 3) from M passes."""
-    def predict(o):
-        with speed.autocast(o.device):
-            return estimator.predict(o, passes=passes)[0]
-
-    return predict
-
-
 @torch.no_grad()
 def measure(data, limit, size, seed, device, predict):
     """`pose_errors` of predict(o) (T, B, 4) over at most `limit` trajectories, with the same noise for every predict."""
     parts = []
     for k, index in enumerate(batches(subset(data, limit), size)):
         o, s, mask = observe(data, index, (seed, 0, k, 3), device)
-        parts.append(pose_errors(predict(o), s[..., :4], o[..., 8], mask))
+        with speed.autocast(device):
+            q_hat = predict(o)
+        parts.append(pose_errors(q_hat, s[..., :4], o[..., 8], mask))
     return {name: np.concatenate([part[name] for part in parts], 1) for name in parts[0]}

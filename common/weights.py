@@ -1,4 +1,6 @@
 """Files of the nets: float16 safetensors that say what to build."""
+import torch
+
 from common.files import UserError, load_tensors, save_tensors
 from common.networks import Estimator, Recurrent
 
@@ -18,7 +20,8 @@ def load(kind, path, device="cpu"):
     """
     tensors, meta = load_tensors(path)
     try:
-        net = kind(**meta)
+        with torch.random.fork_rng(devices=[]):  # its first weights are drawn in vain: they shall not shift what is drawn later
+            net = kind(**meta)
         net.load_state_dict({name: x.float() for name, x in tensors.items()})
     except (TypeError, RuntimeError):
         raise UserError(f"{path} holds another net than expected: rerun its stage with --force, "

@@ -1,6 +1,6 @@
 """The robot's natural runs beside the same policy in 05's world: the same starts and dynamics, the same share of occlusion.
 
-    python tests/robot_gap.py [quick|laptop|paper] [--seed k] [--out root]
+    python tests/robot_gap.py [quick|laptop|paper] [--weights DIR] [--seed k] [--out root]
 
 Reads the logs of `python 06_robot.py <preset> --scenario natural --runs n` and plays each start five times in the stack of
 est_uncertainty, with occlusions of one duration that hide as large a share of the frames as the robot's did.

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from common import film, networks, plots, stacks, statistics, tables, task
+from common import film, networks, plots, stacks, statistics, tables, task, weights
 
 evaluate = importlib.import_module("05_evaluate")
 
@@ -103,6 +103,16 @@ def test_an_episode_can_be_played_again(short):
     assert again["state"].shape[1:] == (7,) and again["o"].shape[1:] == (9,) and again["belief"].shape[1:] == (12,)
     assert len(again["state"]) == len(again["o"]) == len(again["belief"])
     np.testing.assert_array_equal(again["state"], play.episode(m, 7)["state"])
+
+
+def test_a_measurement_is_the_same_whatever_was_measured_before_it(short, tmp_path):
+    """Reading a net draws nothing: a rerun that measures one thing alone gives what the whole run gave."""
+    paths = {("est_uncertainty", 0): tmp_path / "policy.safetensors", "ours": tmp_path / "estimator.safetensors"}
+    weights.save(paths["est_uncertainty", 0], networks.policy(12, (8, 8, 8)))
+    weights.save(paths["ours"], networks.Estimator((8, 8, 8)))
+    play = evaluate.Players(SimpleNamespace(num_envs=6, seed=0, passes=2), paths, torch.device("cpu"))
+    beliefs = [[row["belief"] for row in play.chunk(evaluate.Measurement("est_uncertainty", 6), 0)[2].rows] for _ in range(2)]
+    np.testing.assert_array_equal(*beliefs)
 
 
 def test_recorded_keeps_the_end_of_an_episode(short):

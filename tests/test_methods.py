@@ -37,7 +37,9 @@ def test_a_method_is_one_entry_and_05_measures_only_what_is_new(study, extended,
     for method in ("est_uncertainty", "end_to_end"):
         shutil.copytree(study / "smoke/04_train_policy" / method, own / "04_train_policy" / method)
     kept = json.loads((results.parent / "measurements.json").read_text())
-    kept["success_rate/end_to_end/0"][1] = [1] * 16  # a number that no measurement would give
+    key, = (key for key in kept if key.startswith("success_rate/end_to_end/0 "))
+    kept[key] = [1] * 16  # a number that no measurement would give
+    kept = {key: values for key, values in kept.items() if "/est/" not in key}
     (results.parent / "measurements.json").write_text(json.dumps(kept))
 
     assert "mine" in extended("04_train_policy", "--method", "mine")
@@ -57,7 +59,7 @@ def test_a_method_is_one_entry_and_05_measures_only_what_is_new(study, extended,
     before = json.loads((results.parent / "measurements.json").read_text())
     assert "left out, as not trained: est_mse; behavior_cloning\n" in extended("05_evaluate")
     after = json.loads((results.parent / "measurements.json").read_text())
-    assert after.keys() - before.keys() == {"success_rate/mine/7", "success_rate/est/0", *(
+    assert {key.split()[0] for key in after.keys() - before.keys()} == {"success_rate/mine/7", "success_rate/est/0", *(
         f"occlusion_duration/est/{seconds}" for seconds in ("0", "2.5", "5", "10", "full"))}
     assert json.loads(results.read_text())["success_rate"]["mine"]["seeds"]["count"] == 2
 

@@ -100,16 +100,26 @@ def test_an_artifact_comes_from_the_weights_else_from_the_own_study(config, tmp_
     published, both = make(there, "01_a", 1), config(weights=tmp_path / "there")
     own = make(config(), "02_b", 2, {"a": make(config(), "01_a", 3)})
     assert runs.find(both, "01_a", "net.st") == published
-    assert runs.find(config(), "02_b", "net.st") == own
-    with pytest.raises(UserError, match="02_b/seed0 is stale, its input 01_a/seed0/net.st"):
-        runs.find(both, "02_b", "net.st")  # it was made from the own 01_a: not to be mixed with the other
+    assert runs.find(both, "02_b", "net.st") == runs.find(config(), "02_b", "net.st") == own
+    assert runs.Run(both, "03_c", {"b": own}).record["inputs"].keys() == {"02_b/seed0/net.st"}
+    with pytest.raises(runs.Mixed, match="04_d/seed0 would be made from two different 01_a/seed0: call without --weights"):
+        runs.Run(both, "04_d", {"a": published, "b": own})  # which was made from the own 01_a
     shutil.rmtree(own.parent)
     own = make(both, "02_b", 2, {"a": published})
-    assert runs.find(both, "02_b", "net.st") == own
     assert f"from {tmp_path / 'there'}: 01_a/seed0" in capsys.readouterr().out
-    run = runs.Run(both, "03_c", {"a": published, "b": own})
+    run = runs.Run(both, "04_d", {"a": published, "b": own})
     assert run.record["inputs"].keys() == {"01_a/seed0/net.st", "02_b/seed0/net.st"}
     assert runs.seeds(both.roots, "02_b") == {0: own.parent}
+    with pytest.raises(UserError, match="02_b/seed0 is stale, its input 01_a/seed0/net.st"):
+        runs.find(config(), "02_b", "net.st")
+    with pytest.raises(UserError, match="inputs changed .*or the --weights of before"):
+        runs.Run(config(), "04_d")
+
+
+def test_a_folder_without_runs_is_no_weights(tmp_path):
+    (tmp_path / "0_empty").mkdir()
+    with pytest.raises(UserError, match="--weights .*: no run is in there"):
+        command.parse(Config, {"quick": {}}, "", ["--weights", str(tmp_path)])
 
 
 def test_what_is_not_published_is_one_line(config, tmp_path):
@@ -149,16 +159,20 @@ def test_a_second_process_touches_nothing(config):
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "01_a/seed0: another process is at work here" in told.stdout and not told.stderr
     assert (run.dir / "config.json").stat().st_mtime_ns == before
+    run.finish([])
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert not told.stdout and not told.stderr  # a finished run is free again
 
 
 def test_a_copy_of_a_run_folder_is_no_seed(config):
     paths = [make(config(seed=k), "01_a", k) for k in (0, 10, 2)]
     shutil.copytree(paths[0].parent, paths[0].parent.with_name("seed0_old"))
-    paths[0].parent.with_name("seeds").mkdir()
+    for name in ("seeds", "seed01"):
+        paths[0].parent.with_name(name).mkdir()
     assert list(runs.seeds([config().own], "01_a")) == [0, 2, 10]
 
 
 @pytest.mark.parametrize("out", ["/proc/nothing", "/dev/null/x"])
 def test_an_out_that_cannot_be_made_is_one_line(out):
-    with pytest.raises(UserError, match=f"--out {out}: cannot make"):
+    with pytest.raises(UserError, match=f"cannot make {out}.*another --out"):
         runs.Run(Config(preset="quick", out=Path(out)), "01_a")

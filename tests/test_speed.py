@@ -29,7 +29,7 @@ def fresh(code):
 @pytest.fixture
 def pool(monkeypatch):
     """Sets the number of threads, until the test's end."""
-    monkeypatch.setattr(speed, "threads", speed.threads)
+    monkeypatch.setattr(speed, "pool", speed.pool)
     return speed.set_up
 
 

@@ -61,3 +61,10 @@ def test_the_value_net_begins_as_pi_privs_on_the_true_state(float32):
     value, critic = networks.value(8, SIZES), networks.value(17, SIZES)
     start_from(critic, value, 9)
     torch.testing.assert_close(critic(torch.cat([seen, state], -1))[0], value(state)[0])
+
+
+@pytest.mark.parametrize("entry", [("s_hat", None, "rl"), ("o", "ours", "rl"), ("s", None, "rl"), ("s_hat, sigma", "ours", "pi_priv"),
+                                   ("o", None, "pi_priv"), ("s_hat", "ours", "cloning")])
+def test_an_entry_without_a_stack_is_refused_at_once(entry):
+    with pytest.raises(ValueError, match="no stack of these wrappers"):
+        stacks.Method("mine", *entry)
