@@ -169,8 +169,9 @@ def draw(run, players, results, done):
     levels.pop("priv_on_state")
     plots.success_rate(cfg.roots, run.dir / "success_rate.png", levels)
     plots.success_rate_priv(cfg.roots, run.dir / "success_rate_priv.png")
-    for name in plots.LOSSES:
-        plots.validation_loss(cfg.roots, name, run.dir / f"{name}.png")
+    for name, (_, methods, _) in plots.LOSSES.items():
+        if {*methods} & {*results["estimator_ablation"], *results["success_rate"]}:
+            plots.validation_loss(cfg.roots, name, run.dir / f"{name}.png")
     plots.sim(run.dir / "sim.png")
     if results["occlusion_duration"]:
         plots.occlusion_duration(results["occlusion_duration"], run.dir / "occlusion_duration.png")
