@@ -111,6 +111,7 @@ def check_lineage(cfg: Stage, folder: Path, inputs: dict[str, str]):
         users, todo = {key.rpartition("/")[0]: (user, key) for user, key, _ in reversed(todo)}, []
         for place, (user, key) in users.items():
             records = {root / place: record for root in cfg.roots if (record := record_of(cfg, root / place))}
+            # of each record: which of the artifacts that are known of this place it has as they were
             fits = {path: [{record["outputs"].get(name, {}).get("sha256")} >= shas for name, shas in known[place].items()]
                     for path, record in records.items()}
             if found := next((path for path, matches in fits.items() if all(matches)), None):
