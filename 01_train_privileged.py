@@ -19,14 +19,13 @@ class Config(ppo.Hyperparameters, command.Stage):
     checkpoints: int = 300  # uniformly spaced checkpoints of pi_priv, the untrained and the last included (sec. 4)
 
 
+_QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy_coef=0.002, kl_target=0.015, lr_min=1e-4,
+              lr_max=2e-3, tolerance=4.0, near_share=0.8)
 PRESETS = {
     "smoke": dict(num_envs=32, rollout_steps=16, updates=6, minibatch=256, epochs=2, sizes=(16, 16, 16), checkpoints=3,
                   eval_every=3, eval_episodes=16, resume_every=2, tolerance=4.0, near_share=0.5),
-    "quick": dict(num_envs=1024, rollout_steps=32, updates=500, minibatch=4096, epochs=3, sizes=(64, 128, 64),
-                  checkpoints=26, entropy_coef=0.002, kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0,
-                  near_share=0.8),
-    "laptop": dict(num_envs=1024, rollout_steps=32, updates=1000, minibatch=4096, epochs=3, checkpoints=100,
-                   entropy_coef=0.002, kl_target=0.015, lr_min=1e-4, lr_max=2e-3, tolerance=4.0, near_share=0.8),
+    "quick": _QUICK | dict(updates=500, sizes=(64, 128, 64), checkpoints=26),
+    "laptop": _QUICK | dict(updates=1000, checkpoints=100),
     "paper": {},
 }
 

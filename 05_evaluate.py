@@ -202,7 +202,7 @@ def main(cfg):
     paths = estimators | policies
     run = runs.Run(cfg, "05_evaluate", paths | test_paths, grows=True)
     if left_out:
-        print(f"left out, as not trained: {'; '.join(left_out)}")
+        print(f"left out, as not trained to the end: {'; '.join(left_out)}")
     players, todo = Players(cfg, paths, device), measurements(cfg, policies)
     sha = {name: next(iter(runs.inputs_of(cfg, [path]).values())) for name, path in (paths | test_paths).items()}
     sources = {f"estimator_ablation/{kind}": [*(sha[name] for name in test_paths), sha.get(kind)]

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from common.command import Stage
+from common.command import Reader, Stage
 from common.files import UserError, digest, load_json, make_folder, save_json, write_atomic
 
 VERSIONS = ("torch", "numpy", "pymunk", "gymnasium", "opencv-python-headless", "clarabel")
@@ -79,7 +79,8 @@ def find(cfg: Stage, stage: str, name: str, method: str | None = None, seed: int
         if cfg.preset == "pretrained" and cfg.weights:  # a preset without stages that could be run
             raise Missing(f"{places[0] / name} is missing: {remedy(cfg, places[0])}")
         state = ("unfinished" if records[own] else "missing") + f" (and not in --weights {cfg.weights})" * bool(cfg.weights)
-        raise Missing(f"{own / name} is {state}: {remedy(cfg, own, ' first')}")
+        hint = ", or give the --weights of a finished study" * (isinstance(cfg, Reader) and not cfg.weights)
+        raise Missing(f"{own / name} is {state}: {remedy(cfg, own, ' first')}{hint}")
     path = (there or [own])[0] / name
     record = records[path.parent]
     check_lineage(cfg, path.parent, record["inputs"])
@@ -257,7 +258,7 @@ class Run:
         return (time.monotonic() - _STARTED) / 60 >= self.cfg.max_minutes  # of the command, whatever it runs in turn
 
     def stop(self):
-        print(f"{self.dir}: stopped after {self.minutes():.1f} minutes; the same command, without --force, goes on")
+        print(f"{self.dir}: stopped after {self.minutes():.1f} minutes in all; the same command, without --force, goes on")
 
     def finish(self, outputs: list[str], **extra):
         """Records the artifacts, named relative to the folder, and marks the run finished."""

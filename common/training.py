@@ -105,7 +105,8 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
         ended, successes = batch["success"]
         curriculum = lowered(curriculum[0], curriculum[1] + ended, curriculum[2] + successes)
         stats["steps_per_s"] = hp.num_envs * hp.rollout_steps / (time.perf_counter() - clock)
-        progress.set_postfix_str(f"success {success:.1%}, tolerance {curriculum[0]:.2f}x, {stats['steps_per_s']:,.0f} steps/s",
+        shown = "-" if math.isnan(success) else f"{success:.1%}"  # not measured again yet
+        progress.set_postfix_str(f"success {shown}, tolerance {curriculum[0]:.2f}x, {stats['steps_per_s']:,.0f} steps/s",
                                  refresh=False)
         progress.update()
 
