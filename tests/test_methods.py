@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 ENTRY = """if True:
     import runpy, sys
     from common import stacks, task
-    task.HORIZON = 40  # for time
+    task.HORIZON = 20  # for time
     stacks.METHODS["mine"] = stacks.Method("my own", "s_hat, sigma", "likelihood", "rl")
     sys.argv[:] = sys.argv[1:]
     runpy.run_path(sys.argv[0], run_name="__main__")
@@ -75,7 +75,8 @@ def test_05_measures_pi_priv_alone_where_nothing_else_is_trained(study, extended
 
 def test_a_further_seed_on_the_published_nets_stands_beside_them(study, extended, tmp_path):
     published = tmp_path / "published"
-    shutil.copytree(study / "smoke", published, ignore=shutil.ignore_patterns("05_*", "06_*", "train_*", "validation_*"))
+    shutil.copytree(study / "smoke", published, ignore=shutil.ignore_patterns(
+        "05_*", "06_*", "train_*", "validation_*", "*mse", "likelihood", "est_uncertainty", "end_to_end", "behavior_cloning"))
     stdout = extended("04_train_policy", "--method", "est", "--seed", "3", "--weights", "published")
     assert "from published: 01_train_privileged/seed0, 03_train_estimator/ours/seed0\n" in stdout
     assert [path.name for path in (tmp_path / "runs/smoke").iterdir()] == ["04_train_policy"]
