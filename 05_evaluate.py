@@ -96,7 +96,7 @@ def trained(cfg):
                 path = runs.find(cfg, stage, "policy.safetensors", folder, k)
                 if method.estimator not in (None, *estimators) or k and (name, 0) not in policies:
                     raise runs.Missing
-                runs.check_lineage(cfg, path.parent, runs.inputs_of(cfg, [pi_priv, *estimators.values(), path]))
+                runs.check_lineage(cfg, path.parent, runs.hashes_of(cfg, [pi_priv, *estimators.values(), path]))
                 policies[name, k] = path
             except runs.Missing:
                 left_out.append(label)
@@ -204,7 +204,7 @@ def main(cfg):
     if left_out:
         print(f"left out, as not trained to the end: {'; '.join(left_out)}")
     players, todo = Players(cfg, paths, device), measurements(cfg, policies)
-    sha = {name: next(iter(runs.inputs_of(cfg, [path]).values())) for name, path in (paths | test_paths).items()}
+    sha = {name: next(iter(runs.hashes_of(cfg, [path]).values())) for name, path in (paths | test_paths).items()}
     sources = {f"estimator_ablation/{kind}": [*(sha[name] for name in test_paths), sha.get(kind)]
                for kind in ("vision", *estimators)}
     sources |= {name: [sha[m.method, m.seed], sha.get(METHODS[m.method].estimator)] for name, m in todo.items()}

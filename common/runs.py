@@ -91,7 +91,7 @@ def find(cfg: Stage, stage: str, name: str, method: str | None = None, seed: int
     return path
 
 
-def inputs_of(cfg: Stage, paths) -> dict[str, str]:
+def hashes_of(cfg: Stage, paths) -> dict[str, str]:
     """{path below its root: recorded sha256} of artifacts."""
     roots = {path: next(root for root in cfg.roots if path.is_relative_to(root)) for path in paths}
     return {path.relative_to(root).as_posix(): record_of(cfg, path.parent)["outputs"][path.name]["sha256"]
@@ -166,7 +166,7 @@ class Run:
             "command": " ".join(["python", Path(words[0]).name, *words[1:]]),
             "versions": {"python": sys.version.split()[0]} | {name: version(name) for name in VERSIONS},
             "settings": {field.name: as_json(getattr(cfg, field.name)) for field in self.settings},
-            "inputs": inputs_of(cfg, inputs.values()),
+            "inputs": hashes_of(cfg, inputs.values()),
         }
         check_lineage(cfg, self.dir, self.record["inputs"])
         claim(self.dir)
