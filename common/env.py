@@ -25,7 +25,8 @@ class PushVectorEnv(gym.vector.VectorEnv):
     Infos: `state` (N, 7) true states in SI units and `success` (N,) of this step. Where an episode ended, `_final_obs` (N,)
     is set, `final_obs` (N, 8) and `final_state` (N, 7) hold its end, and observation and `state` start the next episode.
 
-    Args: whole_workspace: draw the starts over all of it, not the study's region; sub_steps: physics steps a control step.
+    Args: whole_workspace: draw the starts over all of it, not the study's region; sub_steps: physics steps a control step;
+    threads: as in simulator.Worlds; they change no bit, and pay from about 2,000 worlds a thread on.
 
     Attributes:
         worlds: simulator.Worlds, the physics; its box, pusher, force, dynamics (here the drawn ones) and state are here too.
@@ -35,7 +36,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
 
-    def __init__(self, num_envs=1, *, whole_workspace=False, sub_steps=SUB_STEPS):
+    def __init__(self, num_envs=1, *, whole_workspace=False, sub_steps=SUB_STEPS, threads=1):
         self.num_envs = num_envs
         self.single_observation_space = gym.spaces.Box(-2.0, 2.0, (8,), np.float32)  # positions leave [-1, 1] at the end
         self.single_action_space = gym.spaces.MultiDiscrete([task.BINS, task.BINS])
@@ -43,7 +44,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
         self.tolerance, self.near_share = 1.0, 0.0
         self._start_box = task.HALF if whole_workspace else task.START_BOX
-        self.worlds = Worlds(num_envs, sub_steps)
+        self.worlds = Worlds(num_envs, sub_steps, threads=threads)
         self._steps = np.zeros(num_envs, int)
 
     box, pusher = property(attrgetter("worlds.box")), property(attrgetter("worlds.pusher"))

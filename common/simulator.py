@@ -1,5 +1,7 @@
-"""Physics of planar pushing: many worlds in one pymunk Space, a box and a pusher each, on a table with friction."""
+"""Physics of planar pushing: many worlds in a pymunk Space, a box and a pusher each, on a table with friction."""
 from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numpy as np
 import pymunk
@@ -25,16 +27,62 @@ def _set_all(setter, handles, values):
     deque(map(setter, handles, values.tolist()), maxlen=0)
 
 
+class Part:
+    """The worlds of `rows`, a slice of all, in a pymunk Space of their own, which pymunk.batch reads and writes.
+
+    What is read and written is (2, N, .), of all worlds' boxes and of their pushers.
+    """
+
+    def __init__(self, rows, origin):
+        self.rows, self.space = rows, pymunk.Space()
+        self.space.iterations = ITERATIONS
+        self.space.collision_slop = 1e-4  # m; the default overlap of 0.1 is as wide as the box
+        self.space.collision_bias = 1e-6  # share of a deeper overlap that is left after 1 s
+        self.space.collision_persistence = 1  # a contact that has ended would still report its last impulse
+        self.bodies = [pymunk.Body(1.0, 1.0) for _ in origin]
+        pushers = [pymunk.Body(body_type=pymunk.Body.KINEMATIC) for _ in origin]
+        self.shapes = [pymunk.Poly.create_box(body, tuple(task.BOX[:2])) for body in self.bodies]
+        balls = [pymunk.Circle(pusher, task.RADIUS) for pusher in pushers]
+        for box, pusher, ball, place in zip(self.bodies, pushers, balls, origin.tolist()):
+            box.position = pusher.position = place  # so far apart that no broad phase sees neighbours
+            ball.friction = ball.elasticity = 1.0  # Chipmunk multiplies the pair's values: the box carries the drawn ones
+        self.space.add(*self.bodies, *self.shapes, *pushers, *balls)  # boxes, then pushers: the order of pymunk.batch's arrays
+        self._reader, self._contacts, self._writer = batch.Buffer(), batch.Buffer(), batch.Buffer()
+
+    def read(self, motion):
+        """Reads x, y, theta, v_x, v_y, omega into (2, N, 6)."""
+        self._reader.clear()
+        batch.get_space_bodies(self.space, _MOTION, self._reader)
+        motion[:, self.rows] = np.frombuffer(self._reader.float_buf()).reshape(2, -1, 6)
+
+    def write(self, values, fields):
+        self._writer.set_float_buf(np.ascontiguousarray(values[:, self.rows]))
+        batch.set_space_bodies(self.space, fields, self._writer)
+
+    def sub_step(self, kick, dt, motion):
+        """Physics for dt s after a kick. Returns the contacts: impulse and place, (contacts, 4)."""
+        self.write(kick, _KICK)
+        self.space.step(dt)
+        self.read(motion)
+        self._contacts.clear()
+        batch.get_space_arbiters(self.space, _CONTACT, self._contacts)
+        return np.frombuffer(self._contacts.float_buf()).reshape(-1, 4)
+
+
 class Worlds:
     """`num` worlds side by side: pushers that move as told, boxes that yield to contact and table friction.
 
-    One Space for all, read and written by pymunk.batch: a step costs a few array operations, not a Python loop over worlds.
-    A control step takes 1 / rate s, in `sub_steps` of physics. Attributes: box (N, 3) in m, m, rad; pusher (N, 2) in m; force
-    (N, 2) in N, what the pusher feels, world frame, mean over the control step; dynamics: mass (kg), mu_static, mu_dynamic,
-    mu_pusher, restitution, each (N,); pymunk's space and bodies, the boxes.
+    A step costs a few array operations, not a Python loop over worlds. A control step takes 1 / rate s, in `sub_steps` of
+    physics. With `threads` the worlds are in as many Spaces, stepped side by side (Chipmunk's C calls leave the interpreter's
+    lock): the same bits. Attributes: box (N, 3) in m, m, rad; pusher (N, 2) in m; force (N, 2) in N, what the pusher feels,
+    world frame, mean over the control step; dynamics: mass (kg), mu_static, mu_dynamic, mu_pusher, restitution, each (N,);
+    motion (2, N, 6) of boxes and pushers: place in the grid, angle, their velocities; parts, the Spaces. Raises ValueError:
+    no thread, or more than worlds.
     """
 
-    def __init__(self, num, sub_steps=SUB_STEPS, rate=task.RATE):
+    def __init__(self, num, sub_steps=SUB_STEPS, rate=task.RATE, threads=1):
+        if not 1 <= threads <= num:
+            raise ValueError(f"{threads} threads for {num} worlds: say 1 to {num}")
         self.num, self.rate = num, rate
         self.box, self.pusher, self.force = np.zeros((num, 3)), np.zeros((num, 2)), np.zeros((num, 2))
         self.dynamics = {name: np.zeros(num) for name in DYNAMICS}
@@ -42,25 +90,15 @@ class Worlds:
         self._static, self._dynamic = np.zeros(num), np.zeros(num)  # m/s, what friction can take of a speed in dt
         self._inertia = np.ones((num, 2))  # mass in kg, moment in kg m^2
         self._rest, self._touched, self._held = np.zeros((3, num), bool)  # at rest; pushed in the last sub-step, step
-        self._side = int(np.ceil(np.sqrt(num)))
+        self._side = int(np.ceil(np.sqrt(num)))  # of one grid for all parts: another place would round differently
         self._origin = SPACING * np.stack(np.divmod(np.arange(num), self._side), 1)
-        self.space = pymunk.Space()
-        self.space.iterations = ITERATIONS
-        self.space.collision_slop = 1e-4  # m; the default overlap of 0.1 is as wide as the box
-        self.space.collision_bias = 1e-6  # share of a deeper overlap that is left after 1 s
-        self.space.collision_persistence = 1  # a contact that has ended would still report its last impulse
-        self.bodies = [pymunk.Body(1.0, 1.0) for _ in range(num)]
-        pushers = [pymunk.Body(body_type=pymunk.Body.KINEMATIC) for _ in range(num)]
-        shapes = [pymunk.Poly.create_box(body, tuple(task.BOX[:2])) for body in self.bodies]
-        balls = [pymunk.Circle(pusher, task.RADIUS) for pusher in pushers]
-        for box, pusher, ball, origin in zip(self.bodies, pushers, balls, self._origin.tolist()):
-            box.position = pusher.position = origin  # so far apart that no broad phase sees neighbours
-            ball.friction = ball.elasticity = 1.0  # Chipmunk multiplies the pair's values: the box carries the drawn ones
-        self.space.add(*self.bodies, *shapes, *pushers, *balls)  # boxes, then pushers: the order of pymunk.batch's arrays
-        self._c_boxes = np.array([body._body for body in self.bodies], object)
-        self._c_shapes = np.array([shape._shape for shape in shapes], object)
-        self._kick = np.zeros((2 * num, 6))  # v_x, v_y, omega, f_x, f_y, tau
-        self._reader, self._contacts, self._writer = batch.Buffer(), batch.Buffer(), batch.Buffer()
+        self._pool = ThreadPoolExecutor(max(1, threads - 1))
+        cuts = np.linspace(0, num, threads + 1).astype(int)
+        self.parts = [Part(slice(a, b), self._origin[a:b]) for a, b in pairwise(cuts)]
+        self._c_boxes = np.array([body._body for part in self.parts for body in part.bodies], object)
+        self._c_shapes = np.array([shape._shape for part in self.parts for shape in part.shapes], object)
+        self._c_spaces = np.repeat(np.array([part.space._space for part in self.parts], object), np.diff(cuts))
+        self.motion, self._kick = np.zeros((2, 2, num, 6))
 
     @property
     def state(self):
@@ -80,46 +118,35 @@ class Worlds:
         self._rest[worlds] = False  # so that the next sub-step sets the new mass
         self.box[worlds], self.pusher[worlds], self.force[worlds] = box, pusher, 0.0
         for i in worlds:  # nothing of the last episode stays: contacts keep their impulses, bodies a position correction
-            lib.cpSpaceRemoveShape(self.space._space, self._c_shapes[i])
-            lib.cpSpaceAddShape(self.space._space, self._c_shapes[i])
+            lib.cpSpaceRemoveShape(self._c_spaces[i], self._c_shapes[i])
+            lib.cpSpaceAddShape(self._c_spaces[i], self._c_shapes[i])
             lib.cpBodyUpdatePosition(self._c_boxes[i], 0.0)
-        motion = self._read().copy()
-        for rows, pose in (worlds, box), (self.num + worlds, pusher):
-            motion[rows] = 0.0
-            motion[rows, :pose.shape[1]] = pose
-            motion[rows, :2] += self._origin[worlds]
-        self._write(motion, _MOTION)
+        for motion, pose in zip(self.motion, (box, pusher)):
+            motion[worlds] = 0.0
+            motion[worlds, :pose.shape[1]] = pose
+            motion[worlds, :2] += self._origin[worlds]
+        for part in self.parts:
+            part.write(self.motion, _MOTION)
 
     def step(self, velocity):
         """Moves the pushers with `velocity` (N, 2) in m/s for one control step."""
-        n = self.num
         held = self.force.any(1)  # only a new touch bounces: the sub-steps do not resolve the smaller bounces that follow
         new = np.flatnonzero(held != self._held)
         _set_all(lib.cpShapeSetElasticity, self._c_shapes[new], np.where(held, 0.0, self.dynamics["restitution"])[new])
         self._held = held
-        self._kick[n:, :2] = velocity
-        motion, impulse = self._read(), np.zeros((n, 2))
-        change = np.linalg.norm(velocity - motion[n:, 3:5], axis=1)
+        motion, pusher = self.motion
+        change = np.linalg.norm(velocity - pusher[:, 3:5], axis=1)
+        self._kick[1, :, :2], impulse = velocity, np.zeros((self.num, 2))
         for k in range(self._sub_steps):
-            self._apply_friction(motion[:n, 3:], change if k == 0 else np.zeros(n))
-            self._write(self._kick, _KICK)
-            self.space.step(self._dt)
-            self._add_impulses(impulse)
-            motion = self._read()
-        self.box = motion[:n, :3].copy()
+            self._apply_friction(motion[:, 3:], change if k == 0 else np.zeros(self.num))
+            arguments = self._kick, self._dt, self.motion
+            others = [self._pool.submit(part.sub_step, *arguments) for part in self.parts[1:]]
+            contacts = [self.parts[0].sub_step(*arguments), *(other.result() for other in others)]
+            self._add_impulses(np.concatenate(contacts), impulse)
+        self.box = motion[:, :3].copy()
         self.box[:, :2] -= self._origin
-        self.pusher = motion[n:, :2] - self._origin
+        self.pusher = pusher[:, :2] - self._origin
         self.force = impulse * self.rate
-
-    def _read(self):
-        """x, y, theta, v_x, v_y, omega (2 N, 6) of boxes, then pushers: a view, until the next call."""
-        self._reader.clear()
-        batch.get_space_bodies(self.space, _MOTION, self._reader)
-        return np.frombuffer(self._reader.float_buf()).reshape(-1, 6)
-
-    def _write(self, values, fields):
-        self._writer.set_float_buf(values)
-        batch.set_space_bodies(self.space, fields, self._writer)
 
     def _apply_friction(self, twist, change):
         """Table friction of the coming sub-step on boxes with velocities (N, 3): the ellipsoidal limit surface
@@ -139,7 +166,7 @@ class Worlds:
         w = np.flatnonzero(slides & self._rest & ~self._touched)
         f_tau = twist[w] * [1.0, 1.0, GYRATION / task.LIMIT_SURFACE_C]  # that would set these in motion, times dt / m
         slides[w] = np.linalg.norm(f_tau, axis=1) > self._static[w]
-        self._kick[:self.num] = 0.0
+        self._kick[0] = 0.0
         w = np.flatnonzero(slides | ~self._rest)
         if w.size:
             pushed = (slides & self._touched)[w, None]
@@ -150,16 +177,14 @@ class Worlds:
             self._rest[w] = rest = ~slides[w] | (remains == 0.0).all(1)
             growth = np.where(rest[:, None], self._static[w, None] / task.MAX_SPEED * _SLOWING, pushed * rate)
             inertia = self._inertia[w] * (1.0 + growth)
-            self._kick[w, :3] = twist[w] * mean[:, [0, 0, 1]]
-            self._kick[w, 3:] = twist[w] * (inertia * (remains - mean) / self._dt)[:, [0, 0, 1]]
+            self._kick[0, w, :3] = twist[w] * mean[:, [0, 0, 1]]
+            self._kick[0, w, 3:] = twist[w] * (inertia * (remains - mean) / self._dt)[:, [0, 0, 1]]
             _set_all(lib.cpBodySetMass, self._c_boxes[w], inertia[:, 0])
             _set_all(lib.cpBodySetMoment, self._c_boxes[w], inertia[:, 1])
 
-    def _add_impulses(self, impulse):
-        """Adds the last sub-step's contact impulses on the pushers to (N, 2)."""
-        self._contacts.clear()
-        batch.get_space_arbiters(self.space, _CONTACT, self._contacts)
-        j, point = np.split(np.frombuffer(self._contacts.float_buf()).reshape(-1, 4), 2, 1)
+    def _add_impulses(self, contacts, impulse):
+        """Adds the last sub-step's contact impulses on the pushers, from (contacts, 4), to (N, 2)."""
+        j, point = np.split(contacts, 2, 1)
         column, row = np.rint(point / SPACING).astype(int).T  # where it happened tells the world
         world = column * self._side + row
         impulse[world] += j  # on the first body of a contact, the pusher: Chipmunk puts circles before polygons

@@ -39,9 +39,7 @@ def play(env, action, steps):
 
 
 def launch(env, velocity, omega=0.0):
-    velocity, omega = np.broadcast_to(velocity, (env.num_envs, 2)), np.broadcast_to(omega, env.num_envs)
-    for body, v, w in zip(env.worlds.bodies, velocity, omega):
-        body.velocity, body.angular_velocity = tuple(v), w
+    env.worlds.motion[0, :, 3:5], env.worlds.motion[0, :, 5] = velocity, omega
 
 
 def west(offset, gap=0.0):
@@ -112,7 +110,7 @@ def test_static_friction_holds_up_to_its_limit(angle):
     for pull, moves in (0.98, False), (1.02, True):
         for i in range(3):
             env = start(box=[0, 0, 0.5], mu_static=mu[i])
-            env.worlds.space.gravity = tuple(pull * mu[i] * G * np.array([np.cos(angle), np.sin(angle)]))
+            env.worlds.parts[0].space.gravity = tuple(pull * mu[i] * G * np.array([np.cos(angle), np.sin(angle)]))
             play(env, REST, 15)
             travel = env.box[0] - [0, 0, 0.5]
             assert (np.linalg.norm(travel[:2]) > 0.01) == moves
@@ -121,7 +119,7 @@ def test_static_friction_holds_up_to_its_limit(angle):
 
 def test_sliding_box_brakes_by_what_friction_leaves_of_a_slope_and_then_holds():
     env = start(mu_dynamic=0.2)
-    env.worlds.space.gravity = (0.1 * G, 0)
+    env.worlds.parts[0].space.gravity = (0.1 * G, 0)
     launch(env, (0.5, 0))
     states = play(env, REST, 30)
     assert env.box[0, 0] == pytest.approx(0.5**2 / (2 * 0.1 * G), rel=0.03)
@@ -205,7 +203,7 @@ def test_force_is_the_impulse_of_the_whole_control_step(restitution):
     gap = np.linspace(0.0002, 0.003, 15)
     env = start(15, pusher=west(np.zeros(15), gap), mu_static=0, mu_dynamic=0, restitution=restitution)
     force = play(env, [10, REST], 3)[..., 5]
-    velocity = np.array([body.velocity.x for body in env.worlds.bodies])
+    velocity = np.array([body.velocity.x for body in env.worlds.parts[0].bodies])
     assert velocity == pytest.approx(0.05 * (1 + restitution), rel=1e-6)
     assert force.sum(0) / task.RATE == pytest.approx(-3.25 * velocity, rel=1e-6)
 
@@ -447,3 +445,27 @@ def test_picture_shows_box_and_pusher_where_they_are(box, pusher):
     assert (height < width) == (box[2] == 0)
     assert centre(is_box) == pytest.approx(box[:2], abs=0.002)  # the white line to its front takes a little
     assert (image[200, 400] < 255).any()  # the target
+
+
+def test_threads_change_no_bit():
+    """Pushes, ends and starts included, with another number of worlds in each Space."""
+    def play(threads):
+        env, rng = PushVectorEnv(50, threads=threads), np.random.default_rng(0)
+        env.near_share = 1.0
+        env.reset(seed=3)
+        states = []
+        for _ in range(task.HORIZON + 5):
+            toward = np.where(env.box[:, :2] > env.pusher, 3, -3)
+            states.append(env.step(np.clip(5 + toward + rng.integers(-2, 3, (50, 2)), 0, 10))[4]["state"])
+        return np.stack(states)
+
+    alone = play(1)
+    assert (alone[..., 5:] != 0).any(-1).mean() > 0.5  # contact
+    for threads in (2, 3):
+        assert np.array_equal(play(threads), alone)
+
+
+@pytest.mark.parametrize("threads", [0, 5])
+def test_threads_without_a_world_are_refused(threads):
+    with pytest.raises(ValueError, match="threads for 4 worlds"):
+        PushVectorEnv(4, threads=threads)
