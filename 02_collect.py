@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from common import command, episodes, networks, plots, runs, symmetry, task, trajectories, weights
+from common import command, episodes, networks, plots, ranks, runs, symmetry, task, trajectories, weights
 from common.env import PushVectorEnv
 from common.files import UserError, write_atomic
 from common.progress import bar
@@ -134,17 +134,23 @@ def main(cfg):
     if run.skip():
         return remove_parts(run)
     todo = {run.dir / f"part_{k:05d}.npz": (k, *job) for k, job in enumerate(jobs(cfg, len(paths)))}
-    unplayed = {part: job for part, job in todo.items() if not part.exists()}
-    clock, total = time.perf_counter(), sum(job[3] for job in unplayed.values())
+    unplayed = [part for part in todo if not part.exists()]
+    clock, total = time.perf_counter(), sum(todo[part][3] for part in unplayed)
     progress = bar(total, "02_collect", unit="trajectory")
-    for part, (k, _, player, count, drifting) in unplayed.items():
-        policy = weights.load(networks.Recurrent, paths[player], device)
-        seed = int(np.random.SeedSequence([cfg.seed, k, 1]).generate_state(1)[0])  # training.begin has [seed, k]
-        states, length, success = collect(policy, count, seed, drifting)
-        write_atomic(part, lambda path: np.savez(path, states=states, length=length, success=success))
-        progress.update(count)
+
+    def play(part):
+        k, _, player, count, drifting = todo[part]
+        seed = int(np.random.SeedSequence([cfg.seed, k, 1]).generate_state(1)[0])  # training.begin has [seed, k, 0, rank]
+        return collect(weights.load(networks.Recurrent, paths[player], device), count, seed, drifting)
+
+    for parts in trajectories.batches(unplayed, ranks.COUNT):
+        for part, (states, length, success) in zip(parts, ranks.spread(parts, play)):
+            write_atomic(part, lambda path: np.savez(path, states=states, length=length, success=success))
+            progress.update(len(length))
         if run.out_of_time():
             return run.stop()
+    if ranks.RANK:
+        return
     rate = total / (time.perf_counter() - clock)
     progress.close()
 

@@ -12,7 +12,7 @@ from typing import Literal
 
 import torch
 
-from common import command, networks, plots, runs, speed, statistics, supervised, trajectories, weights
+from common import command, networks, plots, ranks, runs, speed, statistics, supervised, trajectories, weights
 from common.files import UserError, save_json
 from common.stacks import ESTIMATORS
 
@@ -66,7 +66,8 @@ def error_against_passes(estimator, data, cfg, device):
     def sums(m):
         return trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, lambda o: estimator.predict(o, passes=m)[0])
 
-    return {m: statistics.error_table(sums(m)) for m in (GRID if estimator.dropout else (1,))}
+    done = {m: sums(m) for m in (GRID if estimator.dropout else (1,))}
+    return {m: statistics.error_table(measured) for m, measured in done.items() if measured}
 
 
 def main(cfg):
@@ -83,9 +84,10 @@ def main(cfg):
             continue
         if not train(run, cfg, train_set, validation_set, device):
             return
-        torch.manual_seed(cfg.seed)
         estimator = weights.load(networks.Estimator, run.dir / "estimator.safetensors", device)
         errors = error_against_passes(estimator, validation_set, cfg, device)
+        if ranks.RANK:
+            continue
         save_json(run.dir / "passes.json", errors)
         if len(errors) > 1:
             plots.passes(errors, run.dir / "passes.png")

@@ -12,7 +12,7 @@ from typing import Literal
 
 import torch
 
-from common import command, networks, plots, ppo, runs, speed, stacks, supervised, symmetry, training, trajectories, weights
+from common import command, networks, plots, ppo, ranks, runs, speed, stacks, supervised, symmetry, training, trajectories, weights
 from common.files import UserError
 
 TRAINED = {name: method for name, method in stacks.METHODS.items() if method.training != "pi_priv"}
@@ -95,8 +95,9 @@ def train_rl(run, cfg, paths, device):
     """Recurrent PPO on the method's stack (sec. 3.3). Returns the policy, None when the time limit stopped it."""
     method = TRAINED[cfg.method]
     estimator = weights.load(networks.Estimator, paths["estimator"], device) if method.estimator else None
-    env = stacks.make(method, cfg.num_envs, estimator, cfg.passes, privileged=cfg.privileged_critic)
-    held_out = stacks.make(method, cfg.eval_episodes, estimator, cfg.passes)
+    worlds, measured = training.shares(cfg)
+    env = stacks.make(method, worlds, estimator, cfg.passes, privileged=cfg.privileged_critic)
+    held_out = stacks.make(method, measured, estimator, cfg.passes)
     torch.manual_seed(cfg.seed)
     seen, known = (stack.single_observation_space.shape[0] for stack in (held_out, env))
     pi, critic = networks.policy(seen, cfg.sizes).to(device), networks.value(known, cfg.sizes).to(device)
@@ -143,6 +144,8 @@ def main(cfg):
         pi = (train_bc if cloning else train_rl)(run, cfg, paths, device)
         if pi is None:
             return
+        if ranks.RANK:
+            continue
         weights.save(run.dir / "policy.safetensors", pi)
         if cloning:
             plots.validation_loss(cfg.roots, "bc_loss", run.dir / "bc_loss.png")

@@ -11,6 +11,7 @@ bc_loss. What is not trained is left out; after a further training the same comm
 """
 import hashlib
 import math
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -18,8 +19,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from common import command, episodes, film, geometry, networks, plots, runs, stacks, statistics, tables, task, trajectories
-from common import weights
+from common import command, episodes, film, geometry, networks, plots, ranks, runs, stacks, statistics, tables, task
+from common import trajectories, weights
 from common.files import load_json, save_json, write_atomic
 from common.progress import bar
 from common.stacks import ESTIMATORS, METHODS
@@ -123,17 +124,12 @@ class Players:
         env = film.Recorded(env)
         return *episodes.play(env, self.policy(m.method, m.seed), seed, m.greedy), env
 
-    def measure(self, m, progress, name):
-        """One number an episode: 1 for success, or its contact switches."""
-        values = []
-        for number in range(math.ceil(m.episodes / self.cfg.num_envs)):
-            success, length, env = self.chunk(m, number)
-            if m.switches:
-                success = [geometry.contact_switches(env.episode(i, n)["state"]) for i, n in enumerate(length)]
-            values += [int(x) for x in success[:m.episodes - len(values)]]
-            progress.set_postfix_str(f"{name} {np.mean(values):{'.1f' if m.switches else '.1%'}}", refresh=False)
-            progress.update(min(self.cfg.num_envs, m.episodes - number * self.cfg.num_envs))
-        return values
+    def measure(self, m, number):
+        """One number an episode of a chunk: 1 for success, or its contact switches."""
+        success, length, env = self.chunk(m, number)
+        if m.switches:
+            success = [geometry.contact_switches(env.episode(i, n)["state"]) for i, n in enumerate(length)]
+        return [int(x) for x in success[:m.episodes - number * self.cfg.num_envs]]
 
     def episode(self, m, index):
         """Episode `index` of the list: states, observations, beliefs and success."""
@@ -147,8 +143,38 @@ def estimator_errors(cfg, players, test, kind):
     def predict(o):
         return o[..., :4] if kind == "vision" else players.estimator(kind).predict(o, passes=cfg.test_passes)[0]
 
-    torch.manual_seed(LIST + cfg.seed)
-    return statistics.error_table(trajectories.measure(test, cfg.test, 100, LIST + cfg.seed, players.device, predict))
+    sums = trajectories.measure(test, cfg.test, 100, LIST + cfg.seed, players.device, predict)
+    return statistics.error_table(sums) if sums else None
+
+
+def measure(run, players, todo, test, keys, kept):
+    """Adds to `kept`, and to its file, what {name: key} has and it has not; False when the time limit stopped it.
+
+    Chunks of episodes, and batches of the test set, are shared out among the processes.
+    """
+    def keep(name, values):
+        kept[keys[name]] = values
+        save_json(run.dir / "measurements.json", kept, indent=None)
+
+    for name in [name for name, key in keys.items() if name not in todo and key not in kept]:
+        ranks.lead(keep)(name, estimator_errors(run.cfg, players, test, name.partition("/")[2]))
+        if run.out_of_time():
+            return False
+    new, width = {name: m for name, m in todo.items() if keys[name] not in kept}, run.cfg.num_envs
+    chunks = [(name, number) for name, m in new.items() for number in range(math.ceil(m.episodes / width))]
+    total, ahead = (sum(m.episodes for m in several.values()) for several in (todo, new))
+    progress, values = bar(total, "05_evaluate", unit="episode", initial=total - ahead), defaultdict(list)
+    for jobs in trajectories.batches(chunks, ranks.COUNT):
+        for (name, _), more in zip(jobs, ranks.spread(jobs, lambda job: players.measure(todo[job[0]], job[1]))):
+            values[name] += more
+            progress.set_postfix_str(f"{name} {np.mean(values[name]):{'.1f' if todo[name].switches else '.1%'}}", refresh=False)
+            progress.update(len(more))
+            if len(values[name]) == todo[name].episodes:
+                keep(name, values[name])
+        if run.out_of_time():
+            return False
+    progress.close()
+    return True
 
 
 def report(run):
@@ -209,26 +235,16 @@ def main(cfg):
                for kind in ("vision", *estimators)}
     sources |= {name: [sha[m.method, m.seed], sha.get(METHODS[m.method].estimator)] for name, m in todo.items()}
     keys = {name: f"{name} {hashlib.sha256(repr(files).encode()).hexdigest()[:16]}" for name, files in sources.items()}
-    kept = load_json(run.dir / "measurements.json", "delete it, and the same command measures anew") or {}
+    kept = ranks.lead(load_json)(run.dir / "measurements.json", "delete it, and the same command measures anew") or {}
     if run.finished and set(keys.values()) <= kept.keys() and (run.dir / "results.json").exists():
         report(run)
         return run.skip()
 
-    progress = bar(sum(m.episodes for m in todo.values()), "05_evaluate", unit="episode",
-                   initial=sum(m.episodes for name, m in todo.items() if keys[name] in kept))
-    for name, key in keys.items():
-        if key in kept:
-            continue
-        if name in todo:
-            kept[key] = players.measure(todo[name], progress, name)
-        else:
-            kept[key] = estimator_errors(cfg, players, test, name.partition("/")[2])
-        save_json(run.dir / "measurements.json", kept, indent=None)
-        if run.out_of_time():
-            return run.stop()
+    if not measure(run, players, todo, test, keys, kept):
+        return run.stop()
+    if ranks.RANK:
+        return
     done = {name: kept[key] for name, key in keys.items()}
-    progress.close()
-
     results = statistics.summarise(done)
     save_json(run.dir / "results.json", results)
     sections = (tables.beside_paper, tables.estimator_ablation, tables.success_rate, tables.occlusion_duration, tables.further)

@@ -12,7 +12,7 @@ from typing import ClassVar, Literal
 import torch
 import tyro
 
-from common import speed
+from common import ranks, speed
 from common.files import UserError
 
 
@@ -82,12 +82,16 @@ def parse(config_class: type, presets: dict[str, dict], doc: str, args: list[str
 
 def main(config_class: type, presets: dict[str, dict], run: Callable, doc: str):
     """Runs a stage from the command line. A mistake is one line on stderr and exit code 2, Ctrl-C is 130."""
+    sys.stdout = open(os.devnull, "w") if ranks.RANK else sys.stdout
     sys.stdout.reconfigure(line_buffering=True)
     try:
         cfg = parse(config_class, presets, doc, sys.argv[1:])
-        speed.set_up(cfg.threads)
-        return run(cfg)
+        speed.set_up(cfg.threads, ranks.LOCAL_COUNT)
+        ranks.begin(device_of(cfg))
+        run(cfg)
+        return ranks.end()
     except UserError as mistake:
+        ranks.let_the_cause_speak(mistake)
         message, code = str(mistake), 2
     except KeyboardInterrupt:
         message, code = "interrupted: the same command, without --force, goes on from the last resume point", 130
@@ -96,9 +100,13 @@ def main(config_class: type, presets: dict[str, dict], run: Callable, doc: str):
         sys.exit(141)
     except OSError as failure:
         known = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR)
+        ranks.let_the_cause_speak(failure)
         if failure.errno not in (None, *known):  # numpy gives no errno where the disk is full
             raise
         message, code = f"cannot read or write ({failure}): make room, or choose another --out", 2
+    except Exception as failure:
+        ranks.let_the_cause_speak(failure)
+        raise
     print("error:", " ".join(message.split()), file=sys.stderr)
     sys.exit(code)
 
@@ -106,4 +114,8 @@ def main(config_class: type, presets: dict[str, dict], run: Callable, doc: str):
 def device_of(cfg: Stage) -> torch.device:
     if cfg.device == "cuda" and not torch.cuda.is_available():
         raise UserError("--device cuda: torch finds no GPU here; use --device cpu or auto")
-    return torch.device("cuda" if cfg.device != "cpu" and torch.cuda.is_available() else "cpu")
+    if cfg.device == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    if ranks.LOCAL_COUNT > torch.cuda.device_count():
+        raise UserError(f"{ranks.LOCAL_COUNT} processes for {torch.cuda.device_count()} GPUs: start one for each, or say --device cpu")
+    return torch.device("cuda", ranks.LOCAL)

@@ -2,20 +2,21 @@
 
 PPO sees only a vector env: every policy of the study is another stack of wrappers.
 """
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch.nn import functional as F
 
-from common import speed
+from common import ranks, speed
 from common.command import setting
 from common.networks import forget, log_prob, log_softmax, sample
 
 
 @dataclass
 class Hyperparameters:
-    num_envs: int = 4000  # parallel worlds (tab. hyperparameters)
+    num_envs: int = 4000  # parallel worlds, of all processes together (tab. hyperparameters)
     rollout_steps: int = 100  # steps of each world per update (tab. hyperparameters)
     updates: int = 2000  # rollouts, each followed by an update; the paper gives no number
     minibatch: int = 25000  # steps per mini-batch (tab. hyperparameters)
@@ -123,6 +124,13 @@ def gae(reward, value, next_value, terminated, done, gamma, lam):
     return advantage
 
 
+def moments(x):
+    """Mean and standard deviation of x over all processes."""
+    count, total = ranks.totals(x.numel(), x.double().sum())
+    squares, = ranks.totals((x.double() - total / count).square().sum())
+    return total / count, math.sqrt(squares / (count - 1))
+
+
 def values(critic, obs, hidden, position, sequence):
     """V(s_t) and V(s_{t+1}), each (T, N), from one fused pass over padded sequences (L + 1, S, D).
 
@@ -148,11 +156,12 @@ def sequences(batch, critic, gamma, lam):
     value, next_value = values(critic, obs, hidden_v, position, sequence)
     advantage = gae(batch["reward"], value, next_value, batch["terminated"], batch["done"], gamma, lam)
     returns = advantage + value
-    explained = 1 - (returns - value).var() / returns.var()
-    advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    explained = 1 - (moments(returns - value)[1] / moments(returns)[1])**2
+    mean, std = moments(advantage)
+    advantage = (advantage - mean) / (std + 1e-8)
     steps = {"actions": batch["actions"], "logp": batch["logp"], "advantage": advantage, "returns": returns,
              "mask": torch.ones_like(advantage)}
-    return {"obs": obs[:-1], "hidden_pi": hidden_pi, "hidden_v": hidden_v, "explained": explained.item()} | {
+    return {"obs": obs[:-1], "hidden_pi": hidden_pi, "hidden_v": hidden_v, "explained": explained} | {
         name: pad(x, position, sequence) for name, x in steps.items()}
 
 
@@ -190,8 +199,8 @@ def value_loss(critic, seq, cols, hp):
     return hp.value_coef * loss, loss.detach()[None]
 
 
-def _descend(net, optimizer, loss, seq, batches, hp):
-    """One step of Adam a mini-batch; what else the loss returned, (mini-batches, .).
+def _descend(net, optimizer, loss, group, seq, batches, hp):
+    """One step of Adam a mini-batch; what else the loss returned, (mini-batches, .), over all processes, as the gradient is.
 
     Gradients are clipped per net: together the value's would drown the policy's.
     """
@@ -200,6 +209,7 @@ def _descend(net, optimizer, loss, seq, batches, hp):
         objective, extra = loss(net, seq, cols, hp)
         optimizer.zero_grad(set_to_none=True)
         objective.backward()
+        extra, _ = ranks.average(net.parameters(), extra, seq["mask"][:, cols].sum(), group)
         torch.nn.utils.clip_grad_norm_(net.parameters(), hp.grad_norm)
         optimizer.step()
         stats.append(extra)
@@ -218,13 +228,15 @@ def adapted(lr, kl, hp):
 def update(actor, critic, optimizers, seq, hp):
     """`hp.epochs` passes of PPO over a rollout's sequences; the learning rate follows the KL of the last pass.
 
-    The two nets share nothing: each descends in a thread of its own, with its own of the two `optimizers`.
+    The two nets share nothing: each descends in a thread of its own, with its own of the two `optimizers`. All processes make
+    the same number of mini-batches, each of its own sequences.
 
     Returns: means over the last pass of policy_loss, entropy, kl, clip_fraction and value_loss; the next lr; and explained,
     the share of the returns' variance that the value net explained before the update.
     """
     count = int(seq["mask"][0].sum())
-    per_epoch = min(count, max(1, round(seq["mask"].sum().item() / hp.minibatch)))
+    counts, steps = zip(*ranks.gather((count, seq["mask"].sum().item())))
+    per_epoch = min(*counts, max(1, round(sum(steps) / hp.minibatch)))
 
     def deal():
         """All sequences in random order to mini-batches of one width, filled up with the empty one after the last."""
@@ -232,8 +244,9 @@ def update(actor, critic, optimizers, seq, hp):
         return order.to(seq["mask"].device).view(-1, per_epoch).T
 
     batches = [cols for _ in range(hp.epochs) for cols in deal()]
-    stats = speed.side_by_side(lambda net, optimizer, loss: _descend(net, optimizer, loss, seq, batches, hp),
-                               (actor, critic), optimizers, (policy_loss, value_loss))
+    both = map if seq["mask"].is_cuda and ranks.COUNT > 1 else speed.side_by_side  # nccl knows one order of collectives
+    stats = [*both(lambda *own: _descend(*own, seq, batches, hp),
+                   (actor, critic), optimizers, (policy_loss, value_loss), ranks.groups)]
     last_pass = torch.cat(stats, 1)[-per_epoch:].mean(0).tolist()
     stats = dict(zip(("policy_loss", "entropy", "kl", "clip_fraction", "value_loss"), last_pass))
     lr = adapted(optimizers[0].param_groups[0]["lr"], stats["kl"], hp)

@@ -4,6 +4,8 @@ import time
 
 from tqdm import tqdm
 
+from common import ranks
+
 
 class Lines:
     """Passes tqdm's redrawn line on to stderr as a plain line, at most every 30 s."""
@@ -20,4 +22,5 @@ def bar(over, desc: str, **kw) -> tqdm:
     """A progress bar over an iterable, or over a number of steps told by update()."""
     log = {"file": Lines(), "ncols": 0, "mininterval": 5, "miniters": 1}
     kw |= {"dynamic_ncols": True} if sys.stderr.isatty() else log
+    kw |= {"disable": ranks.RANK > 0}
     return tqdm(over if hasattr(over, "__iter__") else range(over), desc, **kw)

@@ -19,10 +19,12 @@ from pathlib import Path
 
 import torch
 
+from common import ranks
 from common.command import Reader, Stage
 from common.files import UserError, digest, load_json, make_folder, save_json, write_atomic
 
 VERSIONS = ("torch", "numpy", "pymunk", "gymnasium", "opencv-python-headless", "clarabel")
+START = ["torchrun", f"--nproc-per-node {ranks.COUNT}"] if ranks.COUNT > 1 else ["python"]
 _STARTED = time.monotonic()
 _locks = {}  # folder -> descriptor that holds its lock for this process
 
@@ -163,26 +165,36 @@ class Run:
         self.settings = [field for field in fields(cfg) if field.name not in shared and (
             reads is None or field.name in {"seed", *reads})]
         self.record = {
-            "command": " ".join(["python", Path(words[0]).name, *words[1:]]),
+            "command": " ".join([*START, Path(words[0]).name, *words[1:]]),
+            "processes": ranks.COUNT,
             "versions": {"python": sys.version.split()[0]} | {name: version(name) for name in VERSIONS},
             "settings": {field.name: as_json(getattr(cfg, field.name)) for field in self.settings},
             "inputs": hashes_of(cfg, inputs.values()),
         }
+        if any(others != self.record["inputs"] for others in ranks.gather(self.record["inputs"])):
+            raise UserError(f"{self.dir}: the processes find different inputs: give all of them the same folders")
         check_lineage(cfg, self.dir, self.record["inputs"])
-        claim(self.dir)
-        if cfg.force:
-            for path in self.dir.iterdir():
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
-        before = record_of(cfg, self.dir) or {**self.record, "outputs": {}, "finished": False}
-        self.compare(before, grows)
-        self.finished = before["finished"] and before["inputs"] == self.record["inputs"]
-        self.record = before if self.finished or not grows else before | self.record | {
-            "settings": before["settings"], "finished": False}
-        save_json(self.dir / "config.json", self.record)
+        self.record = self.begin(grows)
+        self.finished = self.record["finished"]
         for root in cfg.roots if cfg.weights and not self.finished else ():
             folders = {path.parent.relative_to(root).as_posix() for path in inputs.values() if path.is_relative_to(root)}
             if folders:
                 print(f"from {root}: {', '.join(sorted(folders))}")
+
+    @ranks.lead
+    def begin(self, grows: bool) -> dict:
+        """Claims the folder; the record of before, or a new one. UserError: another process has it, or it was begun otherwise."""
+        claim(self.dir)
+        if self.cfg.force:
+            for path in self.dir.iterdir():
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        before = record_of(self.cfg, self.dir) or {**self.record, "outputs": {}, "finished": False}
+        self.compare(before, grows)
+        if before["finished"] and before["inputs"] == self.record["inputs"]:
+            return before
+        now = self.record | {"settings": before["settings"]} if grows else {}
+        save_json(self.dir / "config.json", record := before | now | {"finished": False})
+        return record
 
     def compare(self, before: dict, grows: bool):
         """UserError where the run was begun otherwise; a setting that it does not know has the value it had then."""
@@ -210,6 +222,8 @@ class Run:
 
     def log(self, **row):
         """Appends a row to metrics.csv. The first row names the columns; a later one may leave some empty, and adds none."""
+        if ranks.RANK:
+            return
         self.columns = self.columns or list(row)
         with open(self.dir / "metrics.csv", "a" if self.logged else "w") as file:
             writer = csv.DictWriter(file, self.columns, extrasaction="ignore", lineterminator="\n")
@@ -228,14 +242,19 @@ class Run:
                     row[key] = float(text or "nan")
         return rows
 
+    @ranks.lead
     def save_resume(self, state: dict):
         """Writes a resume point: tensors, plain numbers and strings in lists and dicts (no numpy)."""
         file = io.BytesIO()
-        torch.save({"state": state, "rows": self.logged, "minutes": self.minutes()}, file)
+        torch.save({"state": state, "rows": self.logged, "minutes": self.minutes(), "processes": ranks.COUNT}, file)
         write_atomic(self.dir / "resume.pt", lambda temporary: temporary.write_bytes(file.getbuffer()))
 
+    @ranks.lead
     def load_resume(self) -> dict | None:
-        """The last resume point, None to begin. Rows logged after it are dropped: they will be logged again."""
+        """The last resume point, None to begin. Rows logged after it are dropped: they will be logged again.
+
+        Raises UserError: it is damaged, or was made with another number of processes.
+        """
         path, metrics = self.dir / "resume.pt", self.dir / "metrics.csv"
         if not path.exists():
             return metrics.unlink(missing_ok=True)
@@ -245,6 +264,8 @@ class Run:
             lines = metrics.read_text().splitlines(keepends=True)[: 1 + self.logged] if self.logged else []
         except Exception:  # whatever torch meets in a damaged file
             raise UserError(f"{path} is damaged: delete it, or use --force, to begin again") from None
+        if (count := saved.get("processes", 1)) != ranks.COUNT:
+            raise UserError(f"{self.dir} was begun with {count} processes, not {ranks.COUNT}: start as many, or use --force")
         self.columns = next(csv.reader(lines), [])
         if lines:
             write_atomic(metrics, lambda temporary: temporary.write_text("".join(lines)))
@@ -254,6 +275,7 @@ class Run:
         """Minutes spent on this run, those before the last resume point included."""
         return self.minutes_before + (time.monotonic() - self.began) / 60
 
+    @ranks.lead
     def out_of_time(self) -> bool:
         return (time.monotonic() - _STARTED) / 60 >= self.cfg.max_minutes  # of the command, whatever it runs in turn
 
@@ -261,9 +283,9 @@ class Run:
         print(f"{self.dir}: stopped after {self.minutes():.1f} minutes in all; the same command, without --force, goes on")
 
     def finish(self, outputs: list[str], **extra):
-        """Records the artifacts, named relative to the folder, and marks the run finished."""
+        """Records the artifacts, named relative to the folder, and marks the run finished. On rank 0 alone."""
         self.record["outputs"] = {name: digest(self.dir / name) for name in outputs}
-        self.record |= {"minutes": round(self.minutes(), 2), **extra, "finished": True}
+        self.record |= {"minutes": round(self.minutes(), 2), "processes": ranks.COUNT, **extra, "finished": True}
         save_json(self.dir / "config.json", self.record)
         (self.dir / "resume.pt").unlink(missing_ok=True)
         self.finished = True

@@ -1,6 +1,8 @@
 """Speed, apart from the mathematics: every trick here gives what its plain form gives, sooner (tests/test_speed.py)."""
 import contextlib
 import ctypes
+import os
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 
 import torch
@@ -12,8 +14,10 @@ one_thread = {"initializer": torch.set_num_threads, "initargs": (1,)}  # OpenMP 
 pool = ThreadPoolExecutor(2, **one_thread)  # runs independent jobs side by side; a job must not wait for another
 
 
-def set_up(threads=2):
+def set_up(threads=2, processes=1):
     """Makes the process a stage's: one thread inside an operation, `threads` above it, freed memory kept.
+
+    Of several `processes` on this machine each has its share of the cores, and no more threads than these.
 
     Two threads inside an operation wait for each other at each, and for any other job: 30 times slower on a busy machine. And
     a training takes and frees arrays of the same sizes all the time, whose pages the kernel would zero anew, a fifth of PPO's
@@ -21,6 +25,8 @@ def set_up(threads=2):
     """
     global pool
     torch.set_num_threads(1)
+    if processes > 1:
+        threads = max(1, min(threads, os.cpu_count() // processes))
     pool = ThreadPoolExecutor(threads, **one_thread)
     with contextlib.suppress(AttributeError, OSError, TypeError):
         mallopt = ctypes.CDLL(None).mallopt
@@ -31,6 +37,17 @@ def set_up(threads=2):
 def side_by_side(function, *arguments):
     """list(map(function, *arguments)), in the pool's threads."""
     return list(pool.map(function, *arguments))
+
+
+def ahead(function, arguments):
+    """map(function, arguments), the next result computed in a thread while the last one is in use."""
+    with ThreadPoolExecutor(1, **one_thread) as worker:
+        coming = deque()
+        for argument in arguments:
+            coming.append(worker.submit(function, argument))
+            if len(coming) > 1:
+                yield coming.popleft().result()
+        yield from (last.result() for last in coming)
 
 
 def autocast(device):
@@ -91,18 +108,20 @@ def halves(batch):
     return [[x[:int(part[-1].sum(0).max())].contiguous() for x in part] for part in parts]
 
 
-def set_gradient(loss, batch, seeds, usual, parameters):
-    """Sets the gradient of (sum of the loss over the valid steps) / usual, from the halves of a batch, each in a thread.
+def set_gradient(loss, parts, draws, parameters):
+    """Sets the gradient of the loss, a mean over the valid steps of a batch, from its parts (`halves`), each in a thread.
 
-    loss(*batch, generator) is a mean over the valid steps and needs every parameter; `seeds` yields each half's seed.
-    Returns the losses and the numbers of valid steps of the halves.
+    loss(*part, generator) needs every parameter; `draws` is the generator of the parts' seeds.
+    Returns the loss (1,) and the number of valid steps.
     """
-    def descent(part, seed):
-        value, steps = loss(*part, torch.Generator(part[0].device).manual_seed(seed)), part[-1].sum().item()
-        return value.item(), steps, torch.autograd.grad(value * (steps / usual), parameters)
+    total = sum(part[-1].sum().item() for part in parts)
 
-    parts = halves(batch)
-    values, steps, gradients = zip(*side_by_side(descent, parts, [next(seeds) for _ in parts]))
+    def descent(part, seed):
+        value = loss(*part, torch.Generator(part[0].device).manual_seed(seed)) * (part[-1].sum().item() / total)
+        return value.detach()[None], torch.autograd.grad(value, parameters)
+
+    seeds = torch.randint(2**62, (len(parts),), generator=draws).tolist()
+    values, gradients = zip(*side_by_side(descent, parts, seeds))
     for parameter, *shares in zip(parameters, *gradients):
         parameter.grad = sum(shares)
-    return values, steps
+    return sum(values), total

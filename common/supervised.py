@@ -4,7 +4,7 @@ import math
 import numpy as np
 import torch
 
-from common import speed, trajectories
+from common import ranks, speed, trajectories
 from common.files import UserError
 from common.progress import bar
 
@@ -12,11 +12,12 @@ from common.progress import bar
 @torch.no_grad()
 def validate(loss, data, limit, sequences, device):
     """Mean loss over the valid steps of at most `limit` trajectories: the same noise, occlusions and dropout every time."""
-    values, steps = [], []
-    for k, index in enumerate(trajectories.batches(trajectories.subset(data, limit), sequences)):
-        batch = trajectories.observe(data, index, (0, 0, k, 2), device)
-        values.append(loss(*batch, torch.Generator(device).manual_seed(k)).item())
-        steps.append(batch[2].sum().item())
+    def one(job):
+        batch = trajectories.observe(data, job[1], (0, 0, job[0], 2), device)
+        return loss(*batch, torch.Generator(device).manual_seed(job[0])).item(), batch[2].sum().item()
+
+    parts = trajectories.batches(trajectories.subset(data, limit), sequences)
+    values, steps = zip(*ranks.gather(ranks.spread([*enumerate(parts)], one))[0])
     return float(np.average(values, weights=steps))
 
 
@@ -25,9 +26,11 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
 
     An epoch is a resume point, a row of metrics, and draws its noise and occlusions afresh. loss(o, s, mask, generator) of
     a batch of trajectories.observe is the mean over the steps it looks at; it runs in two threads at once, draws from the
-    generator alone, and needs every parameter. save() is called after each epoch of the lowest validation loss so far; one
-    that is not finite raises UserError.
+    generator alone, and needs every parameter. save() is called on rank 0 after each epoch of the lowest validation loss so
+    far. Raises UserError: that is not finite, or there are more processes than trajectories in a mini-batch.
     """
+    if sequences < ranks.COUNT:
+        raise UserError(f"{ranks.COUNT} processes share a mini-batch of {sequences} trajectories: start at most so many")
     parameters = list(net.parameters())
     device, optimizer = parameters[0].device, torch.optim.Adam(parameters, lr=lr)
     count, first, best, lr_end = len(data[1]) - 1, 0, math.inf, lr if lr_end is None else lr_end
@@ -38,17 +41,26 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
     progress = bar(epochs * updates, run.dir.parent.name, initial=first * updates, unit="update")
     for epoch in range(first, epochs):
         rng = np.random.default_rng([seed, epoch])
-        draws = iter(lambda: int(rng.integers(2**62)), None)
+        draws = torch.Generator().manual_seed(int(np.random.default_rng([seed, epoch, ranks.RANK]).integers(2**62)))
+        parts = [index[ranks.RANK::ranks.COUNT] for index in trajectories.shuffled(data, sequences, rng)
+                 if len(index) >= ranks.COUNT]
+
+        def observed(k):  # 1: to train; other numbers elsewhere
+            return trajectories.observe(data, parts[k], (seed, epoch, k, 1, ranks.RANK), device)
+
         losses, weights = [], []
-        for k, index in enumerate(trajectories.shuffled(data, sequences, rng)):
+        for k, batch in enumerate(speed.ahead(observed, range(len(parts)))):
             fall = 1 + math.cos(math.pi * ((epoch + k / updates) / epochs))  # along a cosine from 2 to 0
             optimizer.param_groups[0]["lr"] = lr_end + (lr - lr_end) * fall / 2
-            batch = trajectories.observe(data, index, (seed, epoch, k, 1), device)  # 1: to train; other numbers elsewhere
-            values, steps = speed.set_gradient(loss, batch, draws, usual, parameters)
-            torch.nn.utils.clip_grad_norm_(parameters, grad_norm * sum(steps) / usual)  # a step counts the same in each
+            halves = speed.halves(batch) if ranks.COUNT == 1 else [batch]  # two threads, or a process each
+            mean, steps = speed.set_gradient(loss, halves, draws, parameters)
+            mean, steps = ranks.average(parameters, mean, steps)
+            torch.nn.utils.clip_grad_norm_(parameters, grad_norm)
+            for parameter in parameters:  # a step counts the same in each mini-batch
+                parameter.grad *= steps / usual
             optimizer.step()
-            losses += values
-            weights += steps
+            losses.append(mean.item())
+            weights.append(steps)
             progress.update()
             progress.set_postfix_str(f"loss {losses[-1]:.3f}", refresh=False)
         validation_loss = validate(loss, held_out, validation, sequences, device)
@@ -57,7 +69,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
         run.log(epoch=epoch + 1, train_loss=float(np.average(losses, weights=weights)), validation_loss=validation_loss)
         if validation_loss < best:
             best = validation_loss
-            save()
+            ranks.lead(save)()
         run.save_resume(dict(epoch=epoch + 1, best=best, net=net.state_dict(), optimizer=optimizer.state_dict()))
         if run.out_of_time() and epoch + 1 < epochs:
             run.stop()

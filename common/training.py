@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from common import episodes, ppo
+from common import episodes, ppo, ranks
 from common.files import UserError
 from common.progress import bar
 
@@ -26,30 +26,41 @@ def lowered(tolerance, ended, successes):
 
 
 def ended_episodes(batch, running):
-    """Mean success, return and length of the episodes that ended in a rollout, nan where none did.
+    """Of the episodes that ended in a rollout, in all processes: their number, successes, and {mean success, return, length},
+    nan where none did.
 
     Args:
         running: (2, N) return and length so far of the episodes that run; goes on.
     """
-    sums, (count, successes) = np.zeros(2), batch["success"]
+    sums = np.zeros(2)
     for reward, done in zip(batch["reward"].cpu().numpy(), batch["done"].cpu().numpy()):
         running += np.stack([reward, np.ones_like(reward)])
         sums += running[:, done].sum(1)
         running[:, done] = 0
-    means = np.array([successes, *sums]) / count if count else np.full(3, np.nan)
-    return dict(zip(STATS, means.tolist()))
+    count, successes, *sums = ranks.totals(*batch["success"], *sums)
+    return count, successes, {name: total / count if count else math.nan for name, total in zip(STATS, (successes, *sums))}
 
 
 def held_out_success(env, actor, seed):
-    """Success in the study's episodes at 1x tolerance, the same ones each time, which no update sees."""
+    """Success in the study's episodes at 1x tolerance, the same ones each time, which no update sees; each rank plays some."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return episodes.play(env, actor, seed=10**6 + seed)[0].mean()
+        success = episodes.play(env, actor, seed=10**6 + seed + 2**32 * ranks.RANK)[0]
+    won, count = ranks.totals(success.sum(), len(success))
+    return won / count
+
+
+def shares(hp):
+    """This rank's numbers of worlds, to train in and to measure in. Raises UserError: there are more processes than worlds."""
+    if min(hp.num_envs, hp.eval_episodes) < ranks.COUNT:
+        raise UserError(f"{ranks.COUNT} processes share {hp.num_envs} worlds and {hp.eval_episodes} of --eval-episodes: start at "
+                        f"most {min(hp.num_envs, hp.eval_episodes)}")
+    return ranks.share(hp.num_envs), ranks.share(hp.eval_episodes)
 
 
 def begin(env, actor, critic, seed, k):
     """Seeds everything for the updates from `k` on, and starts all worlds anew: the carry of ppo.rollout."""
-    draw = int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
+    draw = int(np.random.SeedSequence([seed, k, 0, ranks.RANK]).generate_state(1)[0])
     torch.manual_seed(draw)
     obs, _ = env.reset(seed=draw)
     device = next(actor.parameters()).device
@@ -61,12 +72,13 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
 
     Args:
         run: runs.Run, for metrics, resume points and the time limit; hp: ppo.Hyperparameters, with the stage's seed.
-        env, held_out: stacks over a PushVectorEnv to train and to measure in, of hp.num_envs and hp.eval_episodes worlds.
-        keep: keep(update, actor), called before each update and after the last, for checkpoints.
+        env, held_out: stacks over a PushVectorEnv to train and to measure in, with this rank's share of hp.num_envs and
+        hp.eval_episodes worlds.
+        keep: keep(update, actor), called on rank 0 before each update and after the last, for checkpoints.
     Returns: True when trained to the end, False when the time limit stopped it.
     Raises UserError: the KL or the value loss of an update is not finite.
     """
-    worlds, running = env.unwrapped, np.zeros((2, hp.num_envs))
+    worlds, running = env.unwrapped, np.zeros((2, env.num_envs))
     optimizers = [torch.optim.Adam(net.parameters(), lr=hp.lr, eps=1e-5) for net in (actor, critic)]
     kl_end = hp.kl_target if hp.kl_target_end is None else hp.kl_target_end
     first, curriculum, stats, success = 0, (hp.tolerance, 0, 0), dict.fromkeys(STATS, math.nan), math.nan
@@ -76,7 +88,7 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
             part.load_state_dict(saved)
     progress = bar(hp.updates, run.dir.parent.name, initial=first, unit="update")
     for k in range(first, hp.updates + 1):
-        if keep:
+        if keep and ranks.RANK == 0:
             keep(k, actor)
         if k > first or not k:
             row = dict(update=k, steps=k * hp.num_envs * hp.rollout_steps)
@@ -99,10 +111,10 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
         batch, carry = ppo.rollout(env, actor, critic, carry, hp.rollout_steps)
         kl_target = hp.kl_target + (kl_end - hp.kl_target) * k / hp.updates
         seq = ppo.sequences(batch, critic, hp.gamma, hp.lam)
-        stats = ended_episodes(batch, running) | ppo.update(actor, critic, optimizers, seq, replace(hp, kl_target=kl_target))
+        ended, successes, stats = ended_episodes(batch, running)
+        stats |= ppo.update(actor, critic, optimizers, seq, replace(hp, kl_target=kl_target))
         if not math.isfinite(stats["kl"] + stats["value_loss"]):
             raise UserError(f"{run.dir}: training diverged in update {k + 1}: use a lower rate, and --force")
-        ended, successes = batch["success"]
         curriculum = lowered(curriculum[0], curriculum[1] + ended, curriculum[2] + successes)
         stats["steps_per_s"] = hp.num_envs * hp.rollout_steps / (time.perf_counter() - clock)
         shown = "-" if math.isnan(success) else f"{success:.1%}"  # not measured again yet

@@ -2,7 +2,7 @@
 import numpy as np
 import torch
 
-from common import observation, runs, speed, symmetry, task
+from common import observation, ranks, runs, speed, symmetry, task
 from common.files import UserError
 
 POOL = 16  # mini-batches that are sorted by length together: random ones are a quarter padding
@@ -85,11 +85,17 @@ def pose_errors(q_hat, q, occluded, mask):
 
 @torch.no_grad()
 def measure(data, limit, size, seed, device, predict):
-    """`pose_errors` of predict(o) (T, B, 4) over at most `limit` trajectories, with the same noise for every predict."""
-    parts = []
-    for k, index in enumerate(batches(subset(data, limit), size)):
+    """`pose_errors` of predict(o) (T, B, 4) over at most `limit` trajectories, with the same noise for every predict.
+
+    Each process measures some, and rank 0 has them all, the others none. Seeds torch for each batch.
+    """
+    def one(job):
+        k, index = job
         o, s, mask = observe(data, index, (seed, 0, k, 3), device)
+        torch.manual_seed(int(np.random.SeedSequence([seed, k]).generate_state(1)[0]))
         with speed.autocast(device):
             q_hat = predict(o)
-        parts.append(pose_errors(q_hat, s[..., :4], o[..., 8], mask))
-    return {name: np.concatenate([part[name] for part in parts], 1) for name in parts[0]}
+        return pose_errors(q_hat, s[..., :4], o[..., 8], mask)
+
+    parts = ranks.spread([*enumerate(batches(subset(data, limit), size))], one)
+    return {name: np.concatenate([part[name] for part in parts], 1) for name in (parts[0] if parts else ())}

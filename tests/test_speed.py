@@ -245,14 +245,15 @@ def test_halves_have_the_gradient_of_the_whole(lengths, float32):
 @pytest.mark.parametrize("lengths", [[7, 5, 4, 2, 1], [1, 5], [3]])
 def test_the_gradient_that_is_set_is_that_of_plain_autograd(lengths, threads, pool, float32):
     pool(threads)
-    f, batch, usual = small(dropout=0.0), batch_of(lengths), 17
+    f, batch = small(dropout=0.0), batch_of(lengths)
     parameters = list(f.parameters())
-    values, steps = speed.set_gradient(loss_of(f), batch, iter(range(9)), usual, parameters)
+    parts = speed.halves(batch)
+    assert len(parts) == min(2, len(lengths))
+    value, steps = speed.set_gradient(loss_of(f), parts, torch.Generator(), parameters)
     set_, whole = [p.grad.clone() for p in parameters], loss_of(f)(*batch)
-    assert sum(steps) == sum(lengths) and len(values) == len(steps) == min(2, len(lengths))
-    assert sum(value * n for value, n in zip(values, steps)) / sum(steps) == pytest.approx(whole.item(), rel=1e-5)
-    torch.testing.assert_close(set_, list(torch.autograd.grad(whole * sum(lengths) / usual, parameters)))
-    speed.set_gradient(loss_of(f), batch, iter(range(9)), usual, parameters)  # it adds nothing to the last one
+    assert steps == sum(lengths) and value.item() == pytest.approx(whole.item(), rel=1e-5)
+    torch.testing.assert_close(set_, list(torch.autograd.grad(whole, parameters)))
+    speed.set_gradient(loss_of(f), parts, torch.Generator(), parameters)  # it adds nothing to the last one
     torch.testing.assert_close([p.grad for p in parameters], set_)
 
 
@@ -266,9 +267,18 @@ def test_each_half_draws_from_a_seed_of_its_own(pool):
 
     for threads, first in (1, 7), (2, 7), (2, 9):
         pool(threads)
-        seeds, draws = set(), iter(range(first, 99))
-        values, _ = speed.set_gradient(loss, batch, draws, 10, list(f.parameters()))
-        assert seeds == {first, first + 1} and next(draws) == first + 2
-        told.append((values, [p.grad.clone() for p in f.parameters()]))
+        seeds, draws = set(), torch.Generator().manual_seed(first)
+        value, _ = speed.set_gradient(loss, speed.halves(batch), draws, list(f.parameters()))
+        assert len(seeds) == 2
+        told.append((value, [p.grad.clone() for p in f.parameters()]))
     assert told[0][0] == told[1][0] and told[1][0] != told[2][0]
     torch.testing.assert_close(told[0][1], told[1][1], rtol=0, atol=0)
+
+
+def test_what_is_made_ahead_comes_in_order_and_one_early():
+    made = []
+    for used, value in enumerate(speed.ahead(lambda x: made.append(x) or x * x, range(5))):
+        assert value == used**2
+    assert made == [0, 1, 2, 3, 4] and list(speed.ahead(abs, [])) == []
+    with pytest.raises(ZeroDivisionError):
+        list(speed.ahead(lambda x: 1 / x, [1, 0]))
