@@ -12,7 +12,7 @@ from common import geometry, task
 from common.simulator import SUB_STEPS, Worlds
 
 _DRAWS = {"mass": task.MASS, "mu_static": task.MU_STATIC, "mu_dynamic": task.MU_DYNAMIC, "mu_pusher": task.MU_DYNAMIC,
-          "restitution": task.RESTITUTION}
+          "restitution": task.RESTITUTION, "limit_surface_c": task.LIMIT_SURFACE_C}  # in the order in which they are drawn
 
 
 class PushVectorEnv(gym.vector.VectorEnv):
@@ -84,7 +84,8 @@ class PushVectorEnv(gym.vector.VectorEnv):
             one, value = shapes[name], np.asarray(value, float)
             if value.shape not in (one, (self.num_envs, *one)):
                 raise ValueError(f"reset option {name!r} has shape {value.shape}, not {(self.num_envs, *one)} or {one}")
-            if not np.isfinite(value).all() or name in _DRAWS and value.min() < 0 or name == "mass" and value.min() == 0:
+            if not np.isfinite(value).all() or name in _DRAWS and value.min() < 0 or (
+                    name in ("mass", "limit_surface_c") and value.min() == 0):
                 raise ValueError(f"reset option {name!r} is {value}: not finite, or out of its physical range")
             given[name] = np.array(np.broadcast_to(value, (self.num_envs, *one)))
         return given

@@ -29,7 +29,6 @@ MU_STATIC = (0.3, 0.5)
 MU_DYNAMIC = (0.1, 0.3)  # box on table; the pusher on the box is drawn from the same row
 RESTITUTION = (0.1, 0.7)
 GRAVITY = 9.81  # m/s^2
-LIMIT_SURFACE_C = 0.060  # m, friction torque / friction force; a fit between even pressure (0.042) and four corners (0.078)
 
 # Sensing (tab. occlusion_and_noise_params); the per-episode bias and the per-step noise share one standard deviation
 NOISE = np.array([0.0025, 0.0025, 0.05, 0.7, 0.7])  # box x, y (m), theta (rad), force x, y (N)
@@ -40,6 +39,16 @@ MAX_FORCE = 10.0  # N, clip of each axis (appendix B)
 # The study's starts: where the pusher can always get behind the box without leaving the workspace
 START_BOX = np.array([0.20, 0.059])  # m, half widths of the box centre's range
 START_GAP = 0.001  # m, least distance between pusher and box
+
+
+def mean_distance(width, length):
+    """Mean distance of the points of a rectangle from its centre, m."""
+    x, y = width / 2, length / 2
+    return (2 * np.hypot(x, y) + x**2 / y * np.arcsinh(y / x) + y**2 / x * np.arcsinh(x / y)) / 6
+
+
+# Friction torque / friction force, m: from even pressure under the face to all weight on its corners. No real box has it known
+LIMIT_SURFACE_C = (mean_distance(*BOX[:2]), np.linalg.norm(BOX[:2] / 2))
 
 
 def wrap(angle):
