@@ -87,7 +87,7 @@ def jobs(cfg, checkpoints):
                 yield name, player, worlds, round(cfg.drifting * worlds) if name in ("train", "validation") else 0
 
 
-def collect(policy, num_envs, seed, drifting=0):
+def collect(policy, world, num_envs, seed, drifting=0):
     """States (steps, 7), lengths and success of one sampled episode a world; the last `drifting` ones see the box drift."""
     states = np.empty((task.HORIZON, num_envs, 7), np.float32)
 
@@ -95,7 +95,7 @@ def collect(policy, num_envs, seed, drifting=0):
         states[t] = env.unwrapped.state
 
     torch.manual_seed(seed)
-    env = symmetry.Mirrored(Drifting(PushVectorEnv(num_envs), drifting))
+    env = symmetry.Mirrored(Drifting(PushVectorEnv(num_envs, world=world), drifting))
     success, length = episodes.play(env, policy, seed, greedy=False, record=record)
     return states.swapaxes(0, 1)[np.arange(task.HORIZON) < length[:, None]], length, success
 
@@ -140,7 +140,7 @@ def main(cfg):
     for part, (k, _, player, count, drifting) in unplayed.items():
         policy = weights.load(networks.Recurrent, paths[player], device)
         seed = int(np.random.SeedSequence([cfg.seed, k, 1]).generate_state(1)[0])  # training.begin has [seed, k]
-        states, length, success = collect(policy, count, seed, drifting)
+        states, length, success = collect(policy, run.world, count, seed, drifting)
         write_atomic(part, lambda path: np.savez(path, states=states, length=length, success=success))
         progress.update(count)
         if run.out_of_time():

@@ -95,8 +95,8 @@ def train_rl(run, cfg, paths, device):
     """Recurrent PPO on the method's stack (sec. 3.3). Returns the policy, None when the time limit stopped it."""
     method = TRAINED[cfg.method]
     estimator = weights.load(networks.Estimator, paths["estimator"], device) if method.estimator else None
-    env = stacks.make(method, cfg.num_envs, estimator, cfg.passes, privileged=cfg.privileged_critic)
-    held_out = stacks.make(method, cfg.eval_episodes, estimator, cfg.passes)
+    env = stacks.make(method, cfg.num_envs, estimator, cfg.passes, privileged=cfg.privileged_critic, world=run.world)
+    held_out = stacks.make(method, cfg.eval_episodes, estimator, cfg.passes, world=run.world)
     torch.manual_seed(cfg.seed)
     seen, known = (stack.single_observation_space.shape[0] for stack in (held_out, env))
     pi, critic = networks.policy(seen, cfg.sizes).to(device), networks.value(known, cfg.sizes).to(device)

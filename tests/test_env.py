@@ -7,7 +7,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from common import geometry, task
+from common import draw, geometry, task
 from common.env import PushEnv, PushVectorEnv
 from common.simulator import SUB_STEPS
 
@@ -265,16 +265,37 @@ def test_action_bins_are_centimetres_a_second():
     assert velocity == pytest.approx(np.stack([bins - 5, 5 - bins], 1) * 0.01, abs=1e-9)
 
 
-@pytest.mark.parametrize("whole, half", [(False, [0.20, 0.059, np.pi]), (True, [0.30, 0.15, np.pi])])
-def test_starts_fill_their_region(whole, half):
-    env = PushVectorEnv(2000, whole_workspace=whole)
+def start_shares(env, starts):
+    """Starts (N, 3) as shares of their range, which is what is left for the centre at the box's angle where `starts` is box."""
+    x, y = np.abs(draw.SQUARE * HALF_BOX @ geometry.rotation(env.box[:, 2]).transpose(2, 1, 0)).max(1).T
+    half = {"box": np.stack([0.30 - x, 0.15 - y], 1), "centre": [0.30, 0.15], "inner": [0.20, 0.059]}[starts]
+    return env.box / np.pad(np.broadcast_to(half, (len(env.box), 2)), ((0, 0), (0, 1)), constant_values=np.pi)
+
+
+@pytest.mark.parametrize("starts", ["box", "centre", "inner"])
+def test_starts_fill_their_region(starts):
+    env = PushVectorEnv(4000, starts=starts)
     env.reset(seed=8)
-    assert (np.abs(env.box) <= half).all() and (np.abs(env.pusher) <= [0.30, 0.15]).all()
-    assert np.quantile(env.box, [0.25, 0.75], axis=0) == pytest.approx(np.outer([-0.5, 0.5], half), abs=0.06 * half[2])
-    assert (np.abs(env.box).max(0) > 0.98 * np.array(half)).all()
+    shares = start_shares(env, starts)
+    assert (np.abs(shares) <= 1 + 1e-9).all() and (np.abs(env.pusher) <= [0.30, 0.15]).all()
+    assert np.quantile(shares, [0.25, 0.5, 0.75], axis=0) == pytest.approx(np.outer([-0.5, 0, 0.5], np.ones(3)), abs=0.05)
+    assert (np.abs(shares).max(0) > 0.98).all()
+    assert np.abs(np.corrcoef(np.abs(shares).T) - np.eye(3)).max() < 0.06  # as wide at every angle
     distance = [geometry.nearest(box, pusher)[0] for box, pusher in zip(env.box, env.pusher)]
     assert 0.001 <= min(distance) < 0.003
     assert (env.force == 0).all()
+
+
+def test_a_box_starts_whole_within_the_workspace():
+    env = PushVectorEnv(2000)
+    env.reset(seed=8)
+    corners = np.abs([draw.corners(box) for box in env.box])
+    assert (corners <= task.HALF + 1e-9).all() and (corners.max((0, 1)) > task.HALF - 0.002).all()
+    for starts in ("centre", "inner"):
+        env = PushVectorEnv(2000, starts=starts)
+        env.reset(seed=8)
+        outside = (np.abs([draw.corners(box) for box in env.box]) > task.HALF).any((1, 2))
+        assert outside.any() == (starts == "centre")
 
 
 def test_near_starts_are_an_aid():
