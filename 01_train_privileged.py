@@ -9,13 +9,16 @@ are there). Resumes where it stopped.
 from dataclasses import dataclass
 
 import torch
+import tyro
 
 from common import command, networks, plots, ppo, ranks, runs, stacks, training, weights
 from common.files import UserError
+from common.task import World
 
 
 @dataclass
 class Config(ppo.Hyperparameters, command.Stage):
+    world: tyro.conf.OmitArgPrefixes[World] = World()  # settings that hold for all the stages after this one
     checkpoints: int = 300  # uniformly spaced checkpoints of pi_priv, the untrained and the last included (sec. 4)
 
 
@@ -49,7 +52,7 @@ def main(cfg):
         if update in spaced:
             weights.save(run.dir / names[spaced[update]], actor)
 
-    env, held_out = (stacks.make(stacks.METHODS["priv_on_state"], n) for n in training.shares(cfg))
+    env, held_out = (stacks.make(stacks.METHODS["priv_on_state"], n, world=cfg.world) for n in training.shares(cfg))
     if not training.train(run, cfg, env, held_out, pi_priv, critic, keep) or ranks.RANK:
         return
     weights.save(run.dir / "policy.safetensors", pi_priv)

@@ -87,7 +87,7 @@ def jobs(cfg, checkpoints):
                 yield name, player, worlds, round(cfg.drifting * worlds) if name in ("train", "validation") else 0
 
 
-def collect(policy, num_envs, seed, drifting=0):
+def collect(policy, world, num_envs, seed, drifting=0):
     """States (steps, 7), lengths and success of one sampled episode a world; the last `drifting` ones see the box drift."""
     states = np.empty((task.HORIZON, num_envs, 7), np.float32)
 
@@ -95,7 +95,7 @@ def collect(policy, num_envs, seed, drifting=0):
         states[t] = env.unwrapped.state
 
     torch.manual_seed(seed)
-    env = symmetry.Mirrored(Drifting(PushVectorEnv(num_envs), drifting))
+    env = symmetry.Mirrored(Drifting(PushVectorEnv(num_envs, world=world), drifting))
     success, length = episodes.play(env, policy, seed, greedy=False, record=record)
     return states.swapaxes(0, 1)[np.arange(task.HORIZON) < length[:, None]], length, success
 
@@ -141,7 +141,7 @@ def main(cfg):
     def play(part):
         k, _, player, count, drifting = todo[part]
         seed = int(np.random.SeedSequence([cfg.seed, k, 1]).generate_state(1)[0])  # training.begin has [seed, k, 0, rank]
-        return collect(weights.load(networks.Recurrent, paths[player], device), count, seed, drifting)
+        return collect(weights.load(networks.Recurrent, paths[player], device), run.world, count, seed, drifting)
 
     for parts in trajectories.batches(unplayed, ranks.COUNT):
         for part, (states, length, success) in zip(parts, ranks.spread(parts, play)):

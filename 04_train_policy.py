@@ -96,8 +96,8 @@ def train_rl(run, cfg, paths, device):
     method = TRAINED[cfg.method]
     estimator = weights.load(networks.Estimator, paths["estimator"], device) if method.estimator else None
     worlds, measured = training.shares(cfg)
-    env = stacks.make(method, worlds, estimator, cfg.passes, privileged=cfg.privileged_critic)
-    held_out = stacks.make(method, measured, estimator, cfg.passes)
+    env = stacks.make(method, worlds, estimator, cfg.passes, privileged=cfg.privileged_critic, world=run.world)
+    held_out = stacks.make(method, measured, estimator, cfg.passes, world=run.world)
     torch.manual_seed(cfg.seed)
     seen, known = (stack.single_observation_space.shape[0] for stack in (held_out, env))
     pi, critic = networks.policy(seen, cfg.sizes).to(device), networks.value(known, cfg.sizes).to(device)

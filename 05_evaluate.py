@@ -12,7 +12,7 @@ bc_loss. What is not trained is left out; after a further training the same comm
 import hashlib
 import math
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from common import trajectories, weights
 from common.files import load_json, save_json, write_atomic
 from common.progress import bar
 from common.stacks import ESTIMATORS, METHODS
+from common.task import STARTS, World
 
 DURATIONS = {"0": 0.0, "2.5": 2.5, "5": 5.0, "10": 10.0, "full": math.inf}  # s; the paper's own grid is in its plot only
 LIST = 2**40  # first seed of the fixed list: no training draws one as large
@@ -58,19 +59,19 @@ class Measurement:
     episodes: int
     seed: int = 0
     occlusion: float | None = None
-    whole_workspace: bool = False
+    starts: str | None = None  # other ones than the world's
     greedy: bool = True
     switches: bool = False
 
 
-def measurements(cfg, policies):
+def measurements(cfg, policies, world):
     """{where it goes in results.json: Measurement} of {(method, seed): path}, in the order in which they are made."""
     methods = [m for m in METHODS if (m, 0) in policies]
     todo = {f"success_rate/{m}/{k}": Measurement(m, cfg.episodes, k) for m, k in policies}
     todo |= {f"occlusion_duration/{m}/{name}": Measurement(m, cfg.sweep_episodes, occlusion=seconds)
              for m in methods if METHODS[m].reads != "s" for name, seconds in DURATIONS.items()}
     for m in [m for m in ("priv_on_state", "est_uncertainty") if m in methods]:
-        todo[f"whole_workspace_starts/{m}"] = Measurement(m, cfg.episodes, whole_workspace=True)
+        todo |= {f"starts/{starts}/{m}": Measurement(m, cfg.episodes, starts=starts) for starts in STARTS if starts != world.starts}
         todo[f"contact_switches/{m}"] = Measurement(m, cfg.switch_episodes, switches=True)
     if "est_uncertainty" in methods:
         todo["sampled_actions/est_uncertainty"] = Measurement("est_uncertainty", cfg.episodes, greedy=False)
@@ -109,8 +110,8 @@ def trained(cfg):
 class Players:
     """Plays Measurements with the nets at `paths`, a chunk of cfg.num_envs episodes of the fixed list at a time."""
 
-    def __init__(self, cfg, paths, device):
-        self.cfg, self.device = cfg, device
+    def __init__(self, cfg, paths, device, world=World()):
+        self.cfg, self.device, self.world = cfg, device, world
         self.policy = cache(lambda m, seed: weights.load(networks.Recurrent, paths[m, seed], device))
         self.estimator = cache(lambda kind: weights.load(networks.Estimator, paths[kind], device) if kind else None)
 
@@ -120,7 +121,8 @@ class Players:
         torch.manual_seed(seed)
         method = METHODS[m.method]
         estimator = self.estimator(method.estimator)
-        env = stacks.make(method, self.cfg.num_envs, estimator, self.cfg.passes, m.occlusion, m.whole_workspace)
+        world = replace(self.world, starts=m.starts or self.world.starts)
+        env = stacks.make(method, self.cfg.num_envs, estimator, self.cfg.passes, m.occlusion, world=world)
         env = film.Recorded(env)
         return *episodes.play(env, self.policy(m.method, m.seed), seed, m.greedy), env
 
@@ -229,7 +231,7 @@ def main(cfg):
     run = runs.Run(cfg, "05_evaluate", paths | test_paths, grows=True)
     if left_out:
         print(f"left out, as not trained to the end: {'; '.join(left_out)}")
-    players, todo = Players(cfg, paths, device), measurements(cfg, policies)
+    players, todo = Players(cfg, paths, device, run.world), measurements(cfg, policies, run.world)
     sha = {name: next(iter(runs.hashes_of(cfg, [path]).values())) for name, path in (paths | test_paths).items()}
     sources = {f"estimator_ablation/{kind}": [*(sha[name] for name in test_paths), sha.get(kind)]
                for kind in ("vision", *estimators)}

@@ -23,6 +23,7 @@ from common.env import PushVectorEnv
 from common.files import UserError, save_json, write_atomic
 from common.progress import bar
 from common.robot import hardware, iiwa, ik, runlog, safety, scene, tags, views
+from common.task import World
 
 SCENARIOS = ("natural", "hand_5s", "hand_full")
 STEPS = ik.QP_RATE // task.RATE  # QP steps a tick
@@ -67,7 +68,7 @@ def connect(cfg):
     return safety.Guarded(arm, camera.grab)
 
 
-def prepare(arm, cfg, scenario, k):
+def prepare(arm, cfg, scenario, k, world=World()):
     """Box and look-pose of run k of a scenario. Returns from when to when a hand covers the tags, in s."""
     rng = np.random.default_rng([cfg.seed, SCENARIOS.index(scenario), k, 4])
     torch.manual_seed(int(rng.integers(2**62)))  # of the dropout masks
@@ -79,10 +80,10 @@ def prepare(arm, cfg, scenario, k):
         except EOFError:
             raise UserError("a real arm needs someone at the terminal, to place the box") from None
         return hand
-    world = PushVectorEnv(1)
+    env = PushVectorEnv(1, world=world)
     while True:  # a start of the study from which the camera sees the box
-        world.reset(seed=int(rng.integers(2**31)))
-        arm.place(rng, world.box[0], world.pusher[0], world.dynamics, hand)
+        env.reset(seed=int(rng.integers(2**31)))
+        arm.place(rng, env.box[0], env.pusher[0], env.dynamics, hand)
         if tags.Tracker().update(arm.grab()[1], scene.wrist_camera(arm.points, arm.rotation)).seen is not None:
             return hand
 
@@ -162,7 +163,7 @@ def control(arm, f, pi, cfg, hand, rows):
 def perform(arm, f, pi, run, logs, scenario, k):
     """Run k of a scenario, its film and figure, and last its log, by which a rerun knows it; Stop where the arm was stopped."""
     rows, stop, name = [], None, f"{scenario}_{k:03d}"
-    hand = prepare(arm.arm, run.cfg, scenario, k)
+    hand = prepare(arm.arm, run.cfg, scenario, k, run.world)
     try:
         with arm:
             ended = control(arm, f, pi, run.cfg, hand, rows)

@@ -5,7 +5,7 @@ import io
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -19,6 +19,12 @@ from common.files import UserError
 def setting(default, **past):
     """A field that older runs may not know: was="its old name", before=what the code did then, if not what the default does."""
     return field(default=default, metadata=past)
+
+
+def flat(cfg):
+    """[(field, value)] of the settings of a config, those of a group of its, such as the world, among its own."""
+    parts = [(known, getattr(cfg, known.name)) for known in fields(cfg)]
+    return [pair for part in parts for pair in (flat(part[1]) if is_dataclass(part[1]) else [part])]
 
 
 @dataclass
@@ -72,7 +78,7 @@ def parse(config_class: type, presets: dict[str, dict], doc: str, args: list[str
         raise UserError(f"{message}; see {script} {preset} --help") from None
     if cfg.weights and not any(cfg.weights.glob("0*/**/config.json")):
         raise UserError(f"--weights {cfg.weights}: no run is in there; say pretrained, or the runs/<preset> of a study")
-    for name, value in vars(cfg).items():
+    for name, value in ((known.name, value) for known, value in flat(cfg)):
         for number in value if isinstance(value, tuple) else [value]:
             least = int(type(number) is int and name != "seed")
             if type(number) in (int, float) and not number >= least:

@@ -2,6 +2,7 @@
 
 Importing this module registers both as "Push-v0"; gymnasium.make("common.env:Push-v0") imports it by itself.
 """
+from dataclasses import replace
 from operator import attrgetter
 
 import gymnasium as gym
@@ -9,10 +10,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from common import geometry, task
-from common.simulator import SUB_STEPS, Worlds
+from common.simulator import DYNAMICS, SUB_STEPS, Worlds
+from common.task import World
 
-_DRAWS = {"mass": task.MASS, "mu_static": task.MU_STATIC, "mu_dynamic": task.MU_DYNAMIC, "mu_pusher": task.MU_DYNAMIC,
-          "restitution": task.RESTITUTION}
 
 
 class PushVectorEnv(gym.vector.VectorEnv):
@@ -25,7 +25,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
     Infos: `state` (N, 7) true states in SI units and `success` (N,) of this step. Where an episode ended, `_final_obs` (N,)
     is set, `final_obs` (N, 8) and `final_state` (N, 7) hold its end, and observation and `state` start the next episode.
 
-    Args: whole_workspace: draw the starts over all of it, not the study's region; sub_steps: physics steps a control step;
+    Args: world: what is drawn for an episode; starts: other ones than the world's; sub_steps: physics steps a control step;
     threads: as in simulator.Worlds; they change no bit, and pay from about 2,000 worlds a thread on.
 
     Attributes:
@@ -36,14 +36,13 @@ class PushVectorEnv(gym.vector.VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
 
-    def __init__(self, num_envs=1, *, whole_workspace=False, sub_steps=SUB_STEPS, threads=1):
-        self.num_envs = num_envs
+    def __init__(self, num_envs=1, *, world=World(), starts=None, sub_steps=SUB_STEPS, threads=1):
+        self.num_envs, self.world = num_envs, replace(world, starts=starts or world.starts)
         self.single_observation_space = gym.spaces.Box(-2.0, 2.0, (8,), np.float32)  # positions leave [-1, 1] at the end
         self.single_action_space = gym.spaces.MultiDiscrete([task.BINS, task.BINS])
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
         self.tolerance, self.near_share = 1.0, 0.0
-        self._start_box = task.HALF if whole_workspace else task.START_BOX
         self.worlds = Worlds(num_envs, sub_steps, threads=threads)
         self._steps = np.zeros(num_envs, int)
 
@@ -51,14 +50,17 @@ class PushVectorEnv(gym.vector.VectorEnv):
     force, dynamics = property(attrgetter("worlds.force")), property(attrgetter("worlds.dynamics"))
     state = property(attrgetter("worlds.state"))
 
+    def _draw_boxes(self, count):
+        """Poses (count, 3): the angle uniform, then the centre in the rectangle that the world leaves it."""
+        boxes = self.np_random.uniform(-1, 1, (count, 3)) * [1, 1, np.pi]
+        boxes[:, :2] *= self.world.centre_range(boxes[:, 2])
+        return boxes
+
     def _draw_start(self, count, box=None, pusher=None):
-        """Starts of the study around what is given; the curriculum's: box nearer to the target, pusher within 3 cm of it."""
+        """Starts of the world around what is given; the curriculum's: box nearer to the target, pusher within 3 cm of it."""
         rng = self.np_random
-        box_range = [*self._start_box, np.pi]
         near = rng.random(count) < self.near_share
-        boxes = box
-        if box is None:
-            boxes = rng.uniform(-1, 1, (count, 3)) * box_range * np.where(near, rng.random(count), 1.0)[:, None]
+        boxes = self._draw_boxes(count) * np.where(near, rng.random(count), 1.0)[:, None] if box is None else box
         pushers = rng.uniform(-1, 1, (count, 2)) * task.HALF if pusher is None else pusher
         farthest = np.where(near & (pusher is None), 0.03, np.inf)
         for i in range(count if box is None or pusher is None else 0):
@@ -66,25 +68,26 @@ class PushVectorEnv(gym.vector.VectorEnv):
                 if pusher is None:
                     pushers[i] = rng.uniform(-1, 1, 2) * task.HALF
                 else:
-                    boxes[i] = rng.uniform(-1, 1, 3) * box_range
+                    boxes[i] = self._draw_boxes(1)[0]
         return boxes, pushers
 
     def _start(self, worlds, **given):
         box, pusher = self._draw_start(len(worlds), given.pop("box", None), given.pop("pusher", None))
-        drawn = {name: self.np_random.uniform(*limits, len(worlds)) for name, limits in _DRAWS.items()}
+        drawn = {name: self.np_random.uniform(*limits, len(worlds)) for name, limits in self.world.dynamics.items()}
         self.worlds.place(worlds, box, pusher, drawn | given)
         self._steps[worlds] = 0
 
     def _given(self, options):
         """Reset options as arrays (N, ...), checked: Chipmunk would end the process at a negative coefficient."""
-        given, shapes = {}, {"box": (3,), "pusher": (2,)} | dict.fromkeys(_DRAWS, ())
+        given, shapes = {}, {"box": (3,), "pusher": (2,)} | dict.fromkeys(DYNAMICS, ())
         for name, value in (options or {}).items():
             if name not in shapes:
                 raise ValueError(f"unknown reset option {name!r}; known: {', '.join(shapes)}")
             one, value = shapes[name], np.asarray(value, float)
             if value.shape not in (one, (self.num_envs, *one)):
                 raise ValueError(f"reset option {name!r} has shape {value.shape}, not {(self.num_envs, *one)} or {one}")
-            if not np.isfinite(value).all() or name in _DRAWS and value.min() < 0 or name == "mass" and value.min() == 0:
+            if not np.isfinite(value).all() or name in DYNAMICS and value.min() < 0 or (
+                    name in ("mass", "limit_surface_c") and value.min() == 0):
                 raise ValueError(f"reset option {name!r} is {value}: not finite, or out of its physical range")
             given[name] = np.array(np.broadcast_to(value, (self.num_envs, *one)))
         return given
@@ -135,9 +138,9 @@ class PushEnv(gym.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": task.RATE}
 
-    def __init__(self, render_mode=None, whole_workspace=False):
+    def __init__(self, render_mode=None, world=World(), starts=None):
         self.render_mode = render_mode
-        self.vector = PushVectorEnv(1, whole_workspace=whole_workspace)
+        self.vector = PushVectorEnv(1, world=world, starts=starts)
         self.observation_space = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
 

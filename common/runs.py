@@ -13,15 +13,16 @@ import re
 import shutil
 import sys
 import time
-from dataclasses import fields
+from dataclasses import asdict, fields
 from importlib.metadata import version
 from pathlib import Path
 
 import torch
 
 from common import ranks
-from common.command import Reader, Stage
+from common.command import Reader, Stage, flat
 from common.files import UserError, digest, load_json, make_folder, save_json, write_atomic
+from common.task import World
 
 VERSIONS = ("torch", "numpy", "pymunk", "gymnasium", "opencv-python-headless", "clarabel")
 START = ["torchrun", f"--nproc-per-node {ranks.COUNT}"] if ranks.COUNT > 1 else ["python"]
@@ -125,6 +126,19 @@ def check_lineage(cfg: Stage, folder: Path, inputs: dict[str, str]):
                 raise UserError(f"{user} is stale, its input {key} changed: {remedy(cfg, user, ' --force')}")
 
 
+def world_of(cfg: Stage, paths) -> World:
+    """The world that artifacts were made in; of none, that of the config. UserError: of two."""
+    worlds = {}
+    for path in paths:
+        record = record_of(cfg, path.parent)
+        worlds.setdefault(World.of(record["settings"] | record.get("world", {})), path)
+    if len(worlds) > 1:
+        (one, here), (other, there) = [*worlds.items()][:2]
+        words = [f"{name} {x} and {asdict(other)[name]}" for name, x in asdict(one).items() if x != asdict(other)[name]]
+        raise UserError(f"{here} and {there} are of two worlds: {', '.join(words)}")
+    return next(iter(worlds), getattr(cfg, "world", World()))
+
+
 def claim(folder: Path):
     """Makes a run folder, and holds it for this process until it ends or the run is finished. UserError if another has it."""
     make_folder(folder)
@@ -155,6 +169,7 @@ class Run:
         inputs: paths of what the run reads, by any name.
         reads: names of the settings that it reads; none: all of the script's own. No other is recorded or compared.
         grows: inputs may come and change: then a finished run is open again.
+    Attribute world: world.World, that of the inputs.
     """
 
     def __init__(self, cfg: Stage, stage: str, inputs: dict[str, Path] = {}, method=None, reads=None, grows=False):
@@ -162,18 +177,21 @@ class Run:
         self.began, self.minutes_before, self.logged, self.columns = time.monotonic(), 0.0, 0, []
         words = [re.sub(r"(^|=)[/~].*/(?=.)", r"\1", word) for word in sys.argv]  # absolute paths lose their folder
         shared = {field.name for field in fields(Stage)} - {"seed"} | {*cfg.free}
-        self.settings = [field for field in fields(cfg) if field.name not in shared and (
+        self.settings = [(field, as_json(value)) for field, value in flat(cfg) if field.name not in shared and (
             reads is None or field.name in {"seed", *reads})]
         self.record = {
             "command": " ".join([*START, Path(words[0]).name, *words[1:]]),
             "processes": ranks.COUNT,
             "versions": {"python": sys.version.split()[0]} | {name: version(name) for name in VERSIONS},
-            "settings": {field.name: as_json(getattr(cfg, field.name)) for field in self.settings},
+            "settings": {field.name: value for field, value in self.settings},
             "inputs": hashes_of(cfg, inputs.values()),
         }
         if any(others != self.record["inputs"] for others in ranks.gather(self.record["inputs"])):
             raise UserError(f"{self.dir}: the processes find different inputs: give all of them the same folders")
         check_lineage(cfg, self.dir, self.record["inputs"])
+        self.world = world_of(cfg, inputs.values())
+        if inputs:  # the settings of a stage that reads nothing have its world
+            self.record["world"] = as_json(asdict(self.world))
         self.record = self.begin(grows)
         self.finished = self.record["finished"]
         for root in cfg.roots if cfg.weights and not self.finished else ():
@@ -199,11 +217,11 @@ class Run:
     def compare(self, before: dict, grows: bool):
         """UserError where the run was begun otherwise; a setting that it does not know has the value it had then."""
         old, new, changed = before["settings"], self.record["settings"], {"settings": [], "inputs": []}
-        for field in self.settings:
+        for field, _ in self.settings:
             past = old.get(field.metadata.get("was"), as_json(field.metadata.get("before", field.default)))
             if (past := old.get(field.name, past)) != new[field.name]:
                 changed["settings"].append(f"{field.name} {past} -> {new[field.name]}")
-        known = {name for field in fields(self.cfg) for name in (field.name, field.metadata.get("was"))}
+        known = {name for field, _ in flat(self.cfg) for name in (field.name, field.metadata.get("was"))}
         changed["settings"] += [f"{name} is not known here" for name in old if name not in known]
         if not grows:
             old, new = before["inputs"], self.record["inputs"]

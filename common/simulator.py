@@ -15,8 +15,7 @@ ITERATIONS = 5
 SPACING = 10.0  # m between worlds, so that they never meet
 REST = 1e-4  # m/s: a slower box is at rest
 GYRATION = float(task.BOX[:2] @ task.BOX[:2]) / 12  # k^2 in m^2, moment of inertia / mass
-DYNAMICS = ("mass", "mu_static", "mu_dynamic", "mu_pusher", "restitution")
-_SLOWING = np.array([1.0, task.LIMIT_SURFACE_C**2 / GYRATION])  # (1, (c / k)^2)
+DYNAMICS = ("mass", "mu_static", "mu_dynamic", "mu_pusher", "restitution", "limit_surface_c")
 _MOTION = batch.BodyFields.POSITION | batch.BodyFields.ANGLE | batch.BodyFields.VELOCITY | batch.BodyFields.ANGULAR_VELOCITY
 _KICK = batch.BodyFields.VELOCITY | batch.BodyFields.ANGULAR_VELOCITY | batch.BodyFields.FORCE | batch.BodyFields.TORQUE
 _CONTACT = batch.ArbiterFields.TOTAL_IMPULSE | batch.ArbiterFields.POINT_A_1
@@ -75,7 +74,8 @@ class Worlds:
     A step costs a few array operations, not a Python loop over worlds. A control step takes 1 / rate s, in `sub_steps` of
     physics. With `threads` the worlds are in as many Spaces, stepped side by side (Chipmunk's C calls leave the interpreter's
     lock): the same bits. Attributes: box (N, 3) in m, m, rad; pusher (N, 2) in m; force (N, 2) in N, what the pusher feels,
-    world frame, mean over the control step; dynamics: mass (kg), mu_static, mu_dynamic, mu_pusher, restitution, each (N,);
+    world frame, mean over the control step; dynamics: mass (kg), mu_static, mu_dynamic, mu_pusher, restitution,
+    limit_surface_c (m, friction torque over friction force), each (N,);
     motion (2, N, 6) of boxes and pushers: place in the grid, angle, their velocities; parts, the Spaces. Raises ValueError:
     no thread, or more than worlds.
     """
@@ -89,6 +89,7 @@ class Worlds:
         self._sub_steps, self._dt = sub_steps, 1 / rate / sub_steps
         self._static, self._dynamic = np.zeros(num), np.zeros(num)  # m/s, what friction can take of a speed in dt
         self._inertia = np.ones((num, 2))  # mass in kg, moment in kg m^2
+        self._slowing, self._radii, self._levers = np.ones((num, 2)), np.ones((num, 3)), np.ones((num, 3))
         self._rest, self._touched, self._held = np.zeros((3, num), bool)  # at rest; pushed in the last sub-step, step
         self._side = int(np.ceil(np.sqrt(num)))  # of one grid for all parts: another place would round differently
         self._origin = SPACING * np.stack(np.divmod(np.arange(num), self._side), 1)
@@ -109,10 +110,12 @@ class Worlds:
         """Starts `worlds` (k,) anew at poses (k, 3) and (k, 2), at rest, with given dynamics ({name: (k,)})."""
         for name, value in dynamics.items():
             self.dynamics[name][worlds] = value
-        mass, mu_static, mu_dynamic, mu_pusher, restitution = (self.dynamics[name][worlds] for name in DYNAMICS)
+        mass, mu_static, mu_dynamic, mu_pusher, restitution, c = (self.dynamics[name][worlds] for name in DYNAMICS)
         self._inertia[worlds] = mass[:, None] * [1.0, GYRATION]
         self._static[worlds] = mu_static * task.GRAVITY * self._dt
         self._dynamic[worlds] = mu_dynamic * task.GRAVITY * self._dt
+        self._slowing[worlds, 1] = c**2 / GYRATION  # (1, (c / k)^2)
+        self._radii[worlds, 2], self._levers[worlds, 2] = c, GYRATION / c
         _set_all(lib.cpShapeSetFriction, self._c_shapes[worlds], mu_pusher)
         _set_all(lib.cpShapeSetElasticity, self._c_shapes[worlds], restitution)
         self._rest[worlds] = False  # so that the next sub-step sets the new mass
@@ -161,21 +164,21 @@ class Worlds:
         last one plus `change` (N,), the pusher's change of velocity in m/s, which bounds that of n. A box at rest meets the
         pusher with the growth of mu_static at MAX_SPEED, and anything else with its static limit surface.
         """
-        n = np.linalg.norm(twist * [1.0, 1.0, task.LIMIT_SURFACE_C], axis=1)
+        n = np.linalg.norm(twist * self._radii, axis=1)
         slides = n > REST
         w = np.flatnonzero(slides & self._rest & ~self._touched)
-        f_tau = twist[w] * [1.0, 1.0, GYRATION / task.LIMIT_SURFACE_C]  # that would set these in motion, times dt / m
+        f_tau = twist[w] * self._levers[w]  # that would set these in motion, times dt / m
         slides[w] = np.linalg.norm(f_tau, axis=1) > self._static[w]
         self._kick[0] = 0.0
         w = np.flatnonzero(slides | ~self._rest)
         if w.size:
-            pushed = (slides & self._touched)[w, None]
-            rate = (self._dynamic[w] / np.maximum(n[w] + pushed[:, 0] * change[w], REST))[:, None] * _SLOWING
+            pushed, slowing = (slides & self._touched)[w, None], self._slowing[w]
+            rate = (self._dynamic[w] / np.maximum(n[w] + pushed[:, 0] * change[w], REST))[:, None] * slowing
             loss = np.minimum(rate, 1.0)
             remains = np.where(pushed, 1.0 / (1.0 + rate), 1.0 - loss)
             mean = np.where(pushed, 1.0, 1.0 - loss + loss / np.maximum(rate, 1.0) / 2)
             self._rest[w] = rest = ~slides[w] | (remains == 0.0).all(1)
-            growth = np.where(rest[:, None], self._static[w, None] / task.MAX_SPEED * _SLOWING, pushed * rate)
+            growth = np.where(rest[:, None], self._static[w, None] / task.MAX_SPEED * slowing, pushed * rate)
             inertia = self._inertia[w] * (1.0 + growth)
             self._kick[0, w, :3] = twist[w] * mean[:, [0, 0, 1]]
             self._kick[0, w, 3:] = twist[w] * (inertia * (remains - mean) / self._dt)[:, [0, 0, 1]]

@@ -12,6 +12,7 @@ from common.belief import Believed
 from common.env import PushVectorEnv
 from common.observation import Observed
 from common.symmetry import Mirrored, mirror
+from common.task import World
 from common.wrappers import EpisodeWrapper, declare_observations, state_of
 
 
@@ -55,13 +56,13 @@ METHODS = {
 }
 
 
-def make(method, num_envs, estimator=None, passes=1, occlusion=None, whole_workspace=False, privileged=False):
+def make(method, num_envs, estimator=None, passes=1, occlusion=None, privileged=False, world=World()):
     """The vector env that a method's policy acts in.
 
     Args: estimator, passes: the one that the method names, and its M; occlusion: as in ObservationModel, none where the true
-    state is read; whole_workspace: as in PushVectorEnv; privileged: append the true state, see Privileged.
+    state is read; privileged: append the true state, see Privileged; world: as in PushVectorEnv.
     """
-    env = PushVectorEnv(num_envs, whole_workspace=whole_workspace)
+    env = PushVectorEnv(num_envs, world=world)
     env = frame = Mirrored(env if method.reads == "s" else Observed(env, occlusion))
     if method.estimator:
         env = Believed(env, estimator, passes, sigma=method.reads == "s_hat, sigma")

@@ -82,10 +82,11 @@ def occlusion_duration(results):
 
 
 def further(results):
-    """Starts over the whole workspace, and sampled actions."""
-    sections = {"whole_workspace_starts": "starts over the whole workspace", "sampled_actions": "actions sampled"}
-    return "\n".join(f"- {method}, {what}: success {percent(rate)}" for section, what in sections.items()
-                     for method, rate in results.get(section, {}).items())
+    """Other starts, and sampled actions."""
+    sections = {f"starts {name}": rates for name, rates in results.get("starts", {}).items()}
+    sections["actions sampled"] = results.get("sampled_actions", {})
+    return "\n".join(f"- {method}, {what}: success {percent(rate)}" for what, rates in sections.items()
+                     for method, rate in rates.items())
 
 
 def robot(summary):

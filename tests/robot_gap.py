@@ -30,19 +30,21 @@ def main(cfg):
         raise UserError(f"{folder}: no natural runs; run python 06_robot.py {cfg.preset} --scenario natural first")
     settings = runs.record_of(cfg, folder)["settings"]
     cfg = replace(cfg, **{name: settings[name] for name in ("passes", *vars(hardware.Gaps()))})
-    arm, starts = hardware.SimulatedArm(cfg), []
+    paths = [runs.find(cfg, "03_train_estimator", "estimator.safetensors", "ours"),
+             runs.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty")]
+    world, arm, starts = runs.world_of(cfg, paths), hardware.SimulatedArm(cfg), []
     for k in bar(logs, "starts", unit="run"):
-        robot.prepare(arm, cfg, "natural", k)
+        robot.prepare(arm, cfg, "natural", k, world)
         dynamics = {name: value[0] for name, value in arm.worlds.dynamics.items()}
         starts.append({"box": arm.box.copy(), "pusher": arm.points[7, :2]} | dynamics)
     starts = {key: np.array([start[key] for start in starts]) for key in starts[0]}
     share = statistics.robot_runs({"natural": logs})["natural"]["occluded_share"]
     seconds = share / (1 - share) / task.OCCLUSION_START / task.RATE
-    estimator = weights.load(networks.Estimator, runs.find(cfg, "03_train_estimator", "estimator.safetensors", "ours"))
-    policy = weights.load(networks.Recurrent, runs.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty"))
+    estimator, policy = (weights.load(kind, path) for kind, path in zip((networks.Estimator, networks.Recurrent), paths))
     won, hidden, steps = [], 0, 0
     for seed in bar(REPEATS, "05's world", unit="repeat"):
-        env = film.Recorded(stacks.make(stacks.METHODS["est_uncertainty"], len(logs), estimator, cfg.passes, seconds))
+        env = stacks.make(stacks.METHODS["est_uncertainty"], len(logs), estimator, cfg.passes, seconds, world=world)
+        env = film.Recorded(env)
         env.reset = partial(env.reset, options=starts)
         success, length = episodes.play(env, policy, 2**47 + seed)
         won += success.tolist()

@@ -4,14 +4,16 @@ import json
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
+from tyro.conf import OmitArgPrefixes
 
 from common import command, runs
 from common.command import setting
 from common.files import UserError, save_json, save_tensors
+from common.task import C_060, World
 
 ROOT = Path(__file__).parent.parent
 PUBLISHED = [path.parent.relative_to(ROOT / "pretrained") for path in sorted((ROOT / "pretrained").rglob("config.json"))]
@@ -85,11 +87,54 @@ def test_every_published_run_has_the_settings_of_its_preset(folder, tmp_path):
     stage, *method, seed = folder.parts
     module = importlib.import_module(stage)
     options = ["--method", *method] * bool(method) + ["--seed", seed[4:], "--out", str(tmp_path)]
+    if stage.startswith("01"):  # their world
+        options += ["--starts", "inner", "--support", *map(repr, C_060)]
     cfg = command.parse(module.Config, module.PRESETS, "", ["laptop", *options])
     reads = module.settings_of(cfg) if stage.startswith("04") else None
     written = runs.record_of(cfg, tmp_path / "laptop" / folder)
     run = runs.Run(cfg, stage, {}, method[0] if method else None, reads, grows=True)  # whatever its inputs
     assert run.record["settings"] == written["settings"]
+
+
+# Worlds
+
+
+@dataclass
+class Worldly(command.Stage):
+    world: OmitArgPrefixes[World] = World()
+
+
+def test_a_run_has_the_world_of_its_inputs(config, tmp_path):
+    world = World(starts="centre", support=(0.2, 0.4))
+    first = make(Worldly(preset="quick", out=tmp_path / "runs", world=world), "01_a", 1)
+    assert json.loads((first.parent / "config.json").read_text())["settings"] == {
+        "seed": 0, "starts": "centre", "support": [0.2, 0.4]}
+    second = make(config(), "02_b", 2, {"a": first})
+    assert runs.Run(config(), "03_c", {"b": second}).world == world
+    assert runs.Run(Worldly(preset="quick", out=tmp_path), "01_a").world == World()
+
+
+def test_inputs_of_two_worlds_are_one_line(config, tmp_path):
+    cfg = Worldly(preset="quick", out=tmp_path / "runs")
+    one, other = make(cfg, "01_a", 1), make(replace(cfg, world=World(starts="inner")), "01_b", 1)
+    with pytest.raises(UserError, match=r"01_a/.* and .*01_b/.* are of two worlds: starts box and inner$"):
+        runs.Run(config(), "02_c", {"a": one, "b": other})
+
+
+def test_a_run_of_before_the_world_is_known_by_its_world(config, tmp_path):
+    cfg = Worldly(preset="quick", out=tmp_path / "runs")
+    path = make(cfg, "01_a", 1)
+    record(path, starts=None, support=None)
+    old = runs.Run(config(), "02_b", {"a": path}).world
+    assert old == World("inner", C_060) and old.limit_surface_c == (0.060, 0.060)
+    with pytest.raises(UserError, match="starts inner -> box, support "):
+        runs.Run(cfg, "01_a")
+
+
+@pytest.mark.parametrize("folder", PUBLISHED, ids=str)
+def test_published_nets_are_of_the_world_of_before(folder):
+    record = json.loads((ROOT / "pretrained" / folder / "config.json").read_text())
+    assert World.of(record["settings"] | record.get("world", {})) == World("inner", C_060)
 
 
 # Weights from elsewhere

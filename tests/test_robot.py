@@ -8,7 +8,7 @@ from common import simulator, task
 from common.robot import hardware, iiwa, ik, scene, tags
 
 STILL = hardware.Gaps(latency=0, hand_eye_mm=0, hand_eye_deg=0, servo_lag=0, tool_mass=0, force_bias=0, force_noise=0)
-DYNAMICS = {"mass": 3.2, "mu_static": 0.4, "mu_dynamic": 0.2, "mu_pusher": 0.2, "restitution": 0.3}
+DYNAMICS = {"mass": 3.2, "mu_static": 0.4, "mu_dynamic": 0.2, "mu_pusher": 0.2, "restitution": 0.3, "limit_surface_c": 0.06}
 
 
 def placed(gaps=STILL, box=(0.0, 0.0, 0.0), pusher=(-0.1, 0.0), hand=(np.inf, np.inf), seed=0):

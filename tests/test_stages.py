@@ -17,6 +17,7 @@ from conftest import SCRIPTS, run, start
 
 from common import command, files, networks, ppo, runs, stacks, statistics, task, trajectories, weights
 from common.env import PushVectorEnv
+from common.task import World
 
 ROOT = Path(__file__).parent.parent
 SETS = {"train": 48, "validation": 12, "test": 12, "teacher_train": 48, "teacher_validation": 12}
@@ -138,7 +139,7 @@ def test_trajectories_are_whole_episodes_of_the_study(study, name):
     lengths, first, last = np.diff(offsets), states[offsets[:-1]], states[offsets[1:] - 1]
     assert len(lengths) == SETS[name] and lengths.min() >= 1 and lengths.max() <= task.HORIZON
     assert states.dtype == np.float32 and np.isfinite(states).all()
-    assert (np.abs(first[:, :2]) <= task.START_BOX + 1e-6).all() and not first[:, 5:].any()
+    assert (np.abs(first[:, :2]) <= World().centre_range(first[:, 2]) + 1e-6).all() and not first[:, 5:].any()
     assert not task.outside(states[:, :3], states[:, 3:5]).any() and not task.reached(states[:, :3]).any()
     within = np.diff(np.repeat(np.arange(len(lengths)), lengths)) == 0
     assert (np.abs(np.diff(states[:, 3:5], axis=0))[within] <= task.MAX_SPEED / task.RATE + 1e-6).all()
@@ -196,8 +197,8 @@ def test_results_have_every_number(study):
     assert results["success_rate"].keys() == methods
     assert results["occlusion_duration"].keys() == methods - {"priv_on_state"}
     assert all(list(row) == ["0", "2.5", "5", "10", "full"] for row in results["occlusion_duration"].values())
-    assert results["whole_workspace_starts"].keys() == {"priv_on_state", "est_uncertainty"}
-    rates = [*results["success_rate"].values(), *results["whole_workspace_starts"].values()]
+    assert results["starts"].keys() == {"centre", "inner"}
+    rates = [*results["success_rate"].values(), *(rate for row in results["starts"].values() for rate in row.values())]
     for rate in rates + [rate for row in results["occlusion_duration"].values() for rate in row.values()]:
         assert 0 <= rate["low"] <= rate["mean"] <= rate["high"] <= 1 and rate["high"] > rate["low"]
     assert {rate["episodes"] for rate in rates} == {16}
