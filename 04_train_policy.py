@@ -12,7 +12,8 @@ from typing import Literal
 
 import torch
 
-from common import command, networks, plots, ppo, ranks, runs, speed, stacks, supervised, symmetry, training, trajectories, weights
+from common import command, networks, plots, ppo, ranks, runs, speed, stacks, supervised, symmetry, training, trajectories
+from common import weights
 from common.files import UserError
 
 TRAINED = {name: method for name, method in stacks.METHODS.items() if method.training != "pi_priv"}

@@ -123,5 +123,5 @@ def device_of(cfg: Stage) -> torch.device:
     if cfg.device == "cpu" or not torch.cuda.is_available():
         return torch.device("cpu")
     if ranks.LOCAL_COUNT > torch.cuda.device_count():
-        raise UserError(f"{ranks.LOCAL_COUNT} processes for {torch.cuda.device_count()} GPUs: start one for each, or say --device cpu")
+        raise UserError(f"{ranks.LOCAL_COUNT} processes for {torch.cuda.device_count()} GPUs: one for each, or --device cpu")
     return torch.device("cuda", ranks.LOCAL)

@@ -1,4 +1,5 @@
 """Files that are whole or not there, and a user's mistake told in one line."""
+import fcntl
 import hashlib
 import json
 import os
@@ -7,6 +8,9 @@ from pathlib import Path
 
 import safetensors.torch
 import torch
+
+
+_locks = {}  # folder -> descriptor that holds its lock for this process
 
 
 class UserError(Exception):
@@ -19,6 +23,24 @@ def make_folder(path: Path):
         path.mkdir(parents=True, exist_ok=True)
     except OSError as failure:
         raise UserError(f"cannot make {path} ({failure.strerror}): choose another --out") from None
+
+
+def claim(folder: Path):
+    """Makes a run folder, and holds it for this process until it ends or the run is finished. UserError if another has it."""
+    make_folder(folder)
+    if folder.resolve() not in _locks:
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(f"{folder}: another process is at work here; wait, or use another --seed or --out") from None
+        _locks[folder.resolve()] = descriptor
+
+
+def release(folder: Path):
+    """Lets another process have the folder."""
+    if folder.resolve() in _locks:
+        os.close(_locks.pop(folder.resolve()))
 
 
 def write_atomic(path: Path, write: Callable[[Path], object]):

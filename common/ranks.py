@@ -1,7 +1,7 @@
-"""A stage in several processes: `torchrun` starts them and tells each its rank; without it there is one, and all of this is free.
+"""A stage in several processes: torchrun starts them and tells each its rank; without it there is one, and all of this is free.
 
-Every process, a rank, runs the whole script on its share of the work. Rank 0 alone locks, writes, logs and shows the bar. All
-call the same collective functions in the same order, those of two threads in a group each.
+Every process runs the whole script on its share of the work. Rank 0 alone locks, writes, logs and shows the bar. What sums or
+shares out is called by all ranks in the same order; what two threads call at a time has a group for each.
 """
 import functools
 import os

@@ -5,10 +5,8 @@ not), metrics.csv, resume.pt while unfinished, and the artifacts.
 """
 import contextlib
 import csv
-import fcntl
 import io
 import json
-import os
 import re
 import shutil
 import sys
@@ -21,13 +19,12 @@ import torch
 
 from common import ranks
 from common.command import Reader, Stage, flat
-from common.files import UserError, digest, load_json, make_folder, save_json, write_atomic
+from common.files import UserError, claim, digest, load_json, release, save_json, write_atomic
 from common.task import World
 
 VERSIONS = ("torch", "numpy", "pymunk", "gymnasium", "opencv-python-headless", "clarabel")
 START = ["torchrun", f"--nproc-per-node {ranks.COUNT}"] if ranks.COUNT > 1 else ["python"]
 _STARTED = time.monotonic()
-_locks = {}  # folder -> descriptor that holds its lock for this process
 
 
 class Missing(UserError):
@@ -139,24 +136,6 @@ def world_of(cfg: Stage, paths) -> World:
     return next(iter(worlds), getattr(cfg, "world", World()))
 
 
-def claim(folder: Path):
-    """Makes a run folder, and holds it for this process until it ends or the run is finished. UserError if another has it."""
-    make_folder(folder)
-    if folder.resolve() not in _locks:
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UserError(f"{folder}: another process is at work here; wait, or use another --seed or --out") from None
-        _locks[folder.resolve()] = descriptor
-
-
-def release(folder: Path):
-    """Lets another process have the folder."""
-    if folder.resolve() in _locks:
-        os.close(_locks.pop(folder.resolve()))
-
-
 def as_json(value):
     """A setting as config.json holds it."""
     return json.loads(json.dumps(value, default=str))
@@ -201,7 +180,7 @@ class Run:
 
     @ranks.lead
     def begin(self, grows: bool) -> dict:
-        """Claims the folder; the record of before, or a new one. UserError: another process has it, or it was begun otherwise."""
+        """Claims the folder; the record of before, or a new one. UserError: another run has it, or it was begun otherwise."""
         claim(self.dir)
         if self.cfg.force:
             for path in self.dir.iterdir():
