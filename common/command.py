@@ -122,6 +122,8 @@ def device_of(cfg: Stage) -> torch.device:
         raise UserError("--device cuda: torch finds no GPU here; use --device cpu or auto")
     if cfg.device == "cpu" or not torch.cuda.is_available():
         return torch.device("cpu")
+    if ranks.LOCAL_COUNT == 1:
+        return torch.device("cuda")
     if ranks.LOCAL_COUNT > torch.cuda.device_count():
         raise UserError(f"{ranks.LOCAL_COUNT} processes for {torch.cuda.device_count()} GPUs: one for each, or --device cpu")
     return torch.device("cuda", ranks.LOCAL)

@@ -25,6 +25,7 @@ def set_up(threads=2, processes=1):
     """
     global pool
     torch.set_num_threads(1)
+    torch.backends.cuda.matmul.allow_tf32 = True  # as cuDNN's LSTM does anyway
     if processes > 1:
         threads = max(1, min(threads, os.cpu_count() // processes))
     pool = ThreadPoolExecutor(threads, **one_thread)
