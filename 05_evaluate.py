@@ -70,7 +70,8 @@ def measurements(cfg, policies, world):
     todo |= {f"occlusion_duration/{m}/{name}": Measurement(m, cfg.sweep_episodes, occlusion=seconds)
              for m in methods if METHODS[m].reads != "s" for name, seconds in DURATIONS.items()}
     for m in [m for m in ("priv_on_state", "est_uncertainty") if m in methods]:
-        todo |= {f"starts/{starts}/{m}": Measurement(m, cfg.episodes, starts=starts) for starts in STARTS if starts != world.starts}
+        others = [starts for starts in STARTS if starts != world.starts]
+        todo |= {f"starts/{starts}/{m}": Measurement(m, cfg.episodes, starts=starts) for starts in others}
         todo[f"contact_switches/{m}"] = Measurement(m, cfg.switch_episodes, switches=True)
     if "est_uncertainty" in methods:
         todo["sampled_actions/est_uncertainty"] = Measurement("est_uncertainty", cfg.episodes, greedy=False)
@@ -131,7 +132,7 @@ class Players:
         for number in range(math.ceil(m.episodes / self.cfg.num_envs)):
             success, length, env = self.chunk(m, number)
             if m.switches:
-                success = [geometry.contact_switches(env.episode(i, n)["state"]) for i, n in enumerate(length)]
+                success = [geometry.contact_switches(env.episode(i, n)["state"], self.world.box) for i, n in enumerate(length)]
             values += [int(x) for x in success[:m.episodes - len(values)]]
             progress.set_postfix_str(f"{name} {np.mean(values):{'.1f' if m.switches else '.1%'}}", refresh=False)
             progress.update(min(self.cfg.num_envs, m.episodes - number * self.cfg.num_envs))
@@ -149,8 +150,9 @@ def estimator_errors(cfg, players, test, kind):
     def predict(o):
         return o[..., :4] if kind == "vision" else players.estimator(kind).predict(o, passes=cfg.test_passes)[0]
 
-    torch.manual_seed(LIST + cfg.seed)
-    return statistics.error_table(trajectories.measure(test, cfg.test, 100, LIST + cfg.seed, players.device, predict))
+    seed = LIST + cfg.seed
+    torch.manual_seed(seed)
+    return statistics.error_table(trajectories.measure(test, cfg.test, 100, seed, players.device, predict, players.world))
 
 
 def report(run):
@@ -174,7 +176,7 @@ def draw(run, players, results, done):
     for name, (_, methods, _) in plots.LOSSES.items():
         if {*methods} & {*results["estimator_ablation"], *results["success_rate"]}:
             plots.validation_loss(cfg.roots, name, run.dir / f"{name}.png")
-    plots.sim(run.dir / "sim.png")
+    plots.sim(run.dir / "sim.png", players.world)
     if results["occlusion_duration"]:
         plots.occlusion_duration(results["occlusion_duration"], run.dir / "occlusion_duration.png")
 
@@ -185,14 +187,14 @@ def draw(run, players, results, done):
         first = cases[0] if cases else 0
         plots.trajectory_with_uncertainty(
             {m: players.episode(Measurement(m, len(ours), occlusion=math.inf), first) for m in pair},
-            run.dir / "trajectory_with_uncertainty.png", len(cases), len(ours), first)
+            run.dir / "trajectory_with_uncertainty.png", len(cases), len(ours), first, players.world.box)
         shown["trajectory_with_uncertainty"] = {"episode": first, "cases": len(cases), "episodes": len(ours)}
     if "est_uncertainty" in results["success_rate"]:
         success, length, env = players.chunk(Measurement("est_uncertainty", cfg.episodes), 0)
         hidden = np.array([env.episode(i, n)["o"][:, 8].sum() for i, n in enumerate(length)])
         long = np.flatnonzero(success & (hidden >= 5 * task.RATE))  # the first success with 5 s of occlusion
         world = int(long[0]) if long.size else 0
-        film.write(env.episode(world, length[world]), run.dir / "film.mp4", run.dir / "film.gif")
+        film.write(env.episode(world, length[world]), run.dir / "film.mp4", run.dir / "film.gif", players.world)
         shown["film"] = {"episode": world}
     return shown
 

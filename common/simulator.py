@@ -14,7 +14,6 @@ SUB_STEPS = 6  # a control step; tests/test_env.py holds the physics that this n
 ITERATIONS = 5
 SPACING = 10.0  # m between worlds, so that they never meet
 REST = 1e-4  # m/s: a slower box is at rest
-GYRATION = float(task.BOX[:2] @ task.BOX[:2]) / 12  # k^2 in m^2, moment of inertia / mass
 DYNAMICS = ("mass", "mu_static", "mu_dynamic", "mu_pusher", "restitution", "limit_surface_c")
 _MOTION = batch.BodyFields.POSITION | batch.BodyFields.ANGLE | batch.BodyFields.VELOCITY | batch.BodyFields.ANGULAR_VELOCITY
 _KICK = batch.BodyFields.VELOCITY | batch.BodyFields.ANGULAR_VELOCITY | batch.BodyFields.FORCE | batch.BodyFields.TORQUE
@@ -32,7 +31,7 @@ class Part:
     What is read and written is (2, N, .), of all worlds' boxes and of their pushers.
     """
 
-    def __init__(self, rows, origin):
+    def __init__(self, rows, origin, sides):
         self.rows, self.space = rows, pymunk.Space()
         self.space.iterations = ITERATIONS
         self.space.collision_slop = 1e-4  # m; the default overlap of 0.1 is as wide as the box
@@ -40,7 +39,7 @@ class Part:
         self.space.collision_persistence = 1  # a contact that has ended would still report its last impulse
         self.bodies = [pymunk.Body(1.0, 1.0) for _ in origin]
         pushers = [pymunk.Body(body_type=pymunk.Body.KINEMATIC) for _ in origin]
-        self.shapes = [pymunk.Poly.create_box(body, tuple(task.BOX[:2])) for body in self.bodies]
+        self.shapes = [pymunk.Poly.create_box(body, sides) for body in self.bodies]
         balls = [pymunk.Circle(pusher, task.RADIUS) for pusher in pushers]
         for box, pusher, ball, place in zip(self.bodies, pushers, balls, origin.tolist()):
             box.position = pusher.position = place  # so far apart that no broad phase sees neighbours
@@ -73,17 +72,18 @@ class Worlds:
 
     A step costs a few array operations, not a Python loop over worlds. A control step takes 1 / rate s, in `sub_steps` of
     physics. With `threads` the worlds are in as many Spaces, stepped side by side (Chipmunk's C calls leave the interpreter's
-    lock): the same bits. Attributes: box (N, 3) in m, m, rad; pusher (N, 2) in m; force (N, 2) in N, what the pusher feels,
-    world frame, mean over the control step; dynamics: mass (kg), mu_static, mu_dynamic, mu_pusher, restitution,
-    limit_surface_c (m, friction torque over friction force), each (N,);
+    lock): the same bits. `size` is the box's in m. Attributes: box (N, 3) in m, m, rad; pusher (N, 2) in m; force (N, 2) in
+    N, what the pusher feels, world frame, mean over the control step; dynamics: mass (kg), mu_static, mu_dynamic, mu_pusher,
+    restitution, limit_surface_c (m, friction torque over friction force), each (N,);
     motion (2, N, 6) of boxes and pushers: place in the grid, angle, their velocities; parts, the Spaces. Raises ValueError:
     no thread, or more than worlds.
     """
 
-    def __init__(self, num, sub_steps=SUB_STEPS, rate=task.RATE, threads=1):
+    def __init__(self, num, sub_steps=SUB_STEPS, rate=task.RATE, threads=1, size=task.World.box):
         if not 1 <= threads <= num:
             raise ValueError(f"{threads} threads for {num} worlds: say 1 to {num}")
         self.num, self.rate = num, rate
+        self._gyration = float(np.square(size[:2]).sum()) / 12  # k^2 in m^2, moment of inertia / mass
         self.box, self.pusher, self.force = np.zeros((num, 3)), np.zeros((num, 2)), np.zeros((num, 2))
         self.dynamics = {name: np.zeros(num) for name in DYNAMICS}
         self._sub_steps, self._dt = sub_steps, 1 / rate / sub_steps
@@ -95,7 +95,7 @@ class Worlds:
         self._origin = SPACING * np.stack(np.divmod(np.arange(num), self._side), 1)
         self._pool = ThreadPoolExecutor(max(1, threads - 1))
         cuts = np.linspace(0, num, threads + 1).astype(int)
-        self.parts = [Part(slice(a, b), self._origin[a:b]) for a, b in pairwise(cuts)]
+        self.parts = [Part(slice(a, b), self._origin[a:b], size[:2]) for a, b in pairwise(cuts)]
         self._c_boxes = np.array([body._body for part in self.parts for body in part.bodies], object)
         self._c_shapes = np.array([shape._shape for part in self.parts for shape in part.shapes], object)
         self._c_spaces = np.repeat(np.array([part.space._space for part in self.parts], object), np.diff(cuts))
@@ -111,11 +111,11 @@ class Worlds:
         for name, value in dynamics.items():
             self.dynamics[name][worlds] = value
         mass, mu_static, mu_dynamic, mu_pusher, restitution, c = (self.dynamics[name][worlds] for name in DYNAMICS)
-        self._inertia[worlds] = mass[:, None] * [1.0, GYRATION]
+        self._inertia[worlds] = mass[:, None] * [1.0, self._gyration]
         self._static[worlds] = mu_static * task.GRAVITY * self._dt
         self._dynamic[worlds] = mu_dynamic * task.GRAVITY * self._dt
-        self._slowing[worlds, 1] = c**2 / GYRATION  # (1, (c / k)^2)
-        self._radii[worlds, 2], self._levers[worlds, 2] = c, GYRATION / c
+        self._slowing[worlds, 1] = c**2 / self._gyration  # (1, (c / k)^2)
+        self._radii[worlds, 2], self._levers[worlds, 2] = c, self._gyration / c
         _set_all(lib.cpShapeSetFriction, self._c_shapes[worlds], mu_pusher)
         _set_all(lib.cpShapeSetElasticity, self._c_shapes[worlds], restitution)
         self._rest[worlds] = False  # so that the next sub-step sets the new mass

@@ -10,11 +10,11 @@ from common.progress import bar
 
 
 @torch.no_grad()
-def validate(loss, data, limit, sequences, device):
+def validate(loss, data, limit, sequences, device, world):
     """Mean loss over the valid steps of at most `limit` trajectories: the same noise, occlusions and dropout every time."""
     values, steps = [], []
     for k, index in enumerate(trajectories.batches(trajectories.subset(data, limit), sequences)):
-        batch = trajectories.observe(data, index, (0, 0, k, 2), device)
+        batch = trajectories.observe(data, index, (0, 0, k, 2), device, world)
         values.append(loss(*batch, torch.Generator(device).manual_seed(k)).item())
         steps.append(batch[2].sum().item())
     return float(np.average(values, weights=steps))
@@ -43,7 +43,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
         for k, index in enumerate(trajectories.shuffled(data, sequences, rng)):
             fall = 1 + math.cos(math.pi * ((epoch + k / updates) / epochs))  # along a cosine from 2 to 0
             optimizer.param_groups[0]["lr"] = lr_end + (lr - lr_end) * fall / 2
-            batch = trajectories.observe(data, index, (seed, epoch, k, 1), device)  # 1: to train; other numbers elsewhere
+            batch = trajectories.observe(data, index, (seed, epoch, k, 1), device, run.world)  # 1: to train; others elsewhere
             values, steps = speed.set_gradient(loss, batch, draws, usual, parameters)
             torch.nn.utils.clip_grad_norm_(parameters, grad_norm * sum(steps) / usual)  # a step counts the same in each
             optimizer.step()
@@ -51,7 +51,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
             weights += steps
             progress.update()
             progress.set_postfix_str(f"loss {losses[-1]:.3f}", refresh=False)
-        validation_loss = validate(loss, held_out, validation, sequences, device)
+        validation_loss = validate(loss, held_out, validation, sequences, device, run.world)
         if not math.isfinite(validation_loss):
             raise UserError(f"{run.dir}: training diverged in epoch {epoch + 1}: use a lower rate, and --force")
         run.log(epoch=epoch + 1, train_loss=float(np.average(losses, weights=weights)), validation_loss=validation_loss)

@@ -60,12 +60,12 @@ def subset(data, limit):
     return np.linspace(0, total - 1, min(limit, total)).astype(int)
 
 
-def observe(data, index, seed, device):
+def observe(data, index, seed, device, world=task.World()):
     """Batch of freshly drawn o (T, B, 9) and scaled true states (T, B, 8), mirrored by o[0] as in a stack, and mask (T, B)."""
     states, mask = padded(data, index)
-    o = observation.ObservationModel(len(index), seed).trajectory(states)
+    o = observation.ObservationModel(len(index), seed, world=world).trajectory(states)
     sign = symmetry.signs(o[0])
-    o, s = symmetry.mirror(o, sign), symmetry.mirror(task.scale(states), sign)
+    o, s = symmetry.mirror(o, sign), symmetry.mirror(task.scale(states, world.max_force), sign)
     return tuple(torch.as_tensor(x, device=device) for x in (o, s, mask))
 
 
@@ -84,11 +84,11 @@ def pose_errors(q_hat, q, occluded, mask):
 
 
 @torch.no_grad()
-def measure(data, limit, size, seed, device, predict):
+def measure(data, limit, size, seed, device, predict, world=task.World()):
     """`pose_errors` of predict(o) (T, B, 4) over at most `limit` trajectories, with the same noise for every predict."""
     parts = []
     for k, index in enumerate(batches(subset(data, limit), size)):
-        o, s, mask = observe(data, index, (seed, 0, k, 3), device)
+        o, s, mask = observe(data, index, (seed, 0, k, 3), device, world)
         with speed.autocast(device):
             q_hat = predict(o)
         parts.append(pose_errors(q_hat, s[..., :4], o[..., 8], mask))

@@ -10,10 +10,11 @@ from gymnasium.vector import AutoresetMode
 from common import draw, geometry, task
 from common.env import PushEnv, PushVectorEnv
 from common.simulator import SUB_STEPS
+from common.task import World
 
 C = [0.042, 0.060, 0.078]  # m: even pressure, between, four corners
 G = task.GRAVITY
-HALF_BOX = task.BOX[:2] / 2
+HALF_BOX = np.array(World.box[:2]) / 2
 GYRATION = (0.12**2 + 0.10**2) / 12  # m^2, moment of inertia / mass
 REST = 5  # the bin of zero velocity
 MIDDLE = {"mass": 3.25, "mu_static": 0.4, "mu_dynamic": 0.2, "mu_pusher": 0.2, "restitution": 0.4, "limit_surface_c": 0.060}
@@ -298,6 +299,53 @@ def test_a_box_starts_whole_within_the_workspace():
         assert outside.any() == (starts == "centre")
 
 
+OTHER = World(box=(0.14, 0.08, 0.05), mass=(1.0, 2.0), mu_static=(0.2, 0.5), mu_dynamic=(0.3, 0.6), support=(0.5, 0.5))
+
+
+def test_a_world_of_ones_own():
+    env = PushVectorEnv(1000, world=OTHER)
+    env.reset(seed=8)
+    corners = np.abs([draw.corners(box, OTHER.box) for box in env.box])
+    assert (corners <= task.HALF + 1e-9).all() and (corners.max((0, 1)) > task.HALF - 0.004).all()
+    distance = [geometry.nearest(box, pusher, OTHER.box)[0] for box, pusher in zip(env.box, env.pusher)]
+    assert 0.001 <= min(distance) < 0.004
+    mass, c = env.dynamics["mass"], env.dynamics["limit_surface_c"]
+    assert 1.0 <= mass.min() < 1.02 and 1.98 < mass.max() <= 2.0
+    x, y = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 10**6)) * [[0.14], [0.08]]
+    assert c == pytest.approx(np.full(1000, (np.hypot(x, y).mean() + np.hypot(0.07, 0.04)) / 2), abs=1e-4)
+    assert (env.dynamics["mu_static"] >= env.dynamics["mu_dynamic"]).all() and env.dynamics["mu_dynamic"].max() > 0.59
+
+
+def test_a_box_of_another_size_stops_and_is_pushed_as_its_size_says():
+    env = PushVectorEnv(1, world=OTHER)
+    options = MIDDLE | {"box": [0, 0, 0], "mu_dynamic": 0.15, "limit_surface_c": 0.06}
+    env.reset(seed=0, options=options | {"pusher": [-0.2, -0.1]})
+    launch(env, (0, 0), 5.0)
+    play(env, REST, 30)
+    assert env.box[0, 2] == pytest.approx(25 / (2 * 0.15 * G * 0.06 / ((0.14**2 + 0.08**2) / 12)), rel=0.03)
+    env.reset(options=options | {"pusher": [-0.1, 0]})
+    states = play(env, [10, REST], 15)
+    touched = (states[:, 0, 5] != 0).argmax()
+    gap = states[touched:, 0, 0] - states[touched:, 0, 3]
+    assert gap == pytest.approx(np.full(len(gap), 0.07 + task.RADIUS), abs=2e-4)
+
+
+def test_observations_clip_at_the_worlds_force():
+    env = PushVectorEnv(1, world=World(max_force=2.0))
+    env.reset(options=MIDDLE | {"box": [0.1, 0, 0], "pusher": [0.0269, 0]})
+    obs = [env.step([[8, REST]])[0] for _ in range(10)]
+    assert obs[-1][0, 6] == -1.0 and env.force[0, 0] < -2
+
+
+@pytest.mark.parametrize("changes, words", [
+    ({"box": (0.25, 0.2, 0.07)}, "0.32 m, the workspace leaves no room to start"), ({"box": (0.1, 0.0, 0.07)}, "no room"),
+    ({"mass": (2.0, 1.0)}, "--mass 2.0 1.0"), ({"mass": (0.0, 1.0)}, "--mass"), ({"support": (0.5, 0.2)}, "--support"),
+    ({"mu_dynamic": (-0.1, 0.2)}, "--mu-dynamic"), ({"support_offset": (0.1, 0.0)}, "--support-offset")])
+def test_no_such_world(changes, words):
+    with pytest.raises(ValueError, match=words):
+        World(**changes)
+
+
 def test_near_starts_are_an_aid():
     env = PushVectorEnv(400)
     env.near_share = 0.5
@@ -341,7 +389,8 @@ def test_what_is_not_given_keeps_clear_of_what_is(given):
 
 @pytest.mark.parametrize("options", [
     {"masss": 3.0}, {"box": [0, 0]}, {"box": 0.1}, {"box": np.zeros((2, 3))}, {"pusher": np.zeros((3, 1))}, {"mass": [3, 3]},
-    {"mass": np.full((3, 1), 3)}, {"mass": 0}, {"limit_surface_c": 0}, {"mu_pusher": -0.1}, {"restitution": np.nan}, {"box": [np.inf, 0, 0]},
+    {"mass": np.full((3, 1), 3)}, {"mass": 0}, {"limit_surface_c": 0}, {"mu_pusher": -0.1}, {"restitution": np.nan},
+    {"box": [np.inf, 0, 0]},
     {"mass": "heavy"},
 ])
 def test_wrong_options_are_refused(options):

@@ -384,6 +384,16 @@ def test_a_stale_input_names_the_stage_to_redo(copy, call):
     assert is_mistake(*call(out, "04_train_policy"), "stale", "--force")
 
 
+def test_a_box_that_the_robot_is_not_made_for_is_one_line(copy, call):
+    out = copy(4)
+    for path in (out / "smoke").glob("0[34]*/**/config.json"):
+        record = json.loads(path.read_text())
+        record["world"]["box"] = [0.14, 0.10, 0.07]
+        files.save_json(path, record)
+    assert is_mistake(*call(out, "06_robot"), "--box (0.14, 0.1, 0.07)", "made for (0.12, 0.1, 0.07) only")
+    assert not (out / "smoke" / "06_robot").exists()
+
+
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_every_preset_is_a_config(script):
     module = importlib.import_module(script)
@@ -393,8 +403,9 @@ def test_every_preset_is_a_config(script):
 
 def test_mistakes_on_the_command_line_are_one_line(tmp_path):
     for field, value, words in (("--lerning-rate", "1", "--help"), ("--updates", "many", "--updates"),
-                                ("--checkpoints", "1", "say 2 to 7")):
-        process = start(tmp_path / "runs", "01_train_privileged", field, value)
+                                ("--checkpoints", "1", "say 2 to 7"), ("--mass", "2 1", "the least first"),
+                                ("--box", "0.3 0.2 0.07", "no room to start"), ("--starts", "here", "--starts")):
+        process = start(tmp_path / "runs", "01_train_privileged", field, *value.split())
         assert is_mistake(*process.communicate(), process.returncode, field, words)
     assert not (tmp_path / "runs").exists()
 
