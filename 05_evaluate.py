@@ -6,12 +6,12 @@ Reads pi_priv (01), the test set (02), the estimators (03), every finished seed 
 all: those in the folder --weights, which is pretrained/ with the preset pretrained, and the others of the same preset. Writes
 runs/<preset>/05_evaluate/seed<k>/: results.json, tables.md, film.mp4, film.gif, and as PNG the figures of sec. 5 and of the
 appendix: success_rate, occlusion_duration, trajectory_with_uncertainty, sim, success_rate_priv, likelihood_loss, mse_loss,
-bc_loss. What is not trained is left out; after a further training the same command measures what is new, and no more
-(measurements.json). Resumes after the last finished measurement.
+bc_loss; and other_worlds. What is not trained is left out; after a further training the same command measures what is new,
+and no more (measurements.json). Resumes after the last finished measurement.
 """
 import hashlib
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -21,11 +21,11 @@ import torch
 from common import command, episodes, film, geometry, networks, plots, runs, stacks, statistics, tables, task, trajectories
 from common import weights
 from common.files import load_json, save_json, write_atomic
+from common.measurements import Measurement, measurements
 from common.progress import bar
 from common.stacks import ESTIMATORS, METHODS
-from common.task import STARTS, World
+from common.task import World
 
-DURATIONS = {"0": 0.0, "2.5": 2.5, "5": 5.0, "10": 10.0, "full": math.inf}  # s; the paper's own grid is in its plot only
 LIST = 2**40  # first seed of the fixed list: no training draws one as large
 
 
@@ -35,47 +35,20 @@ class Config(command.Reader):
     sweep_episodes: int = 2000  # episodes for each point of the occlusion-duration sweep (sec. 5.3)
     switch_episodes: int = 20_000  # episodes for the contact switches (sec. 5.4)
     passes: int = 50  # M, stochastic passes of the estimator in the loop (sec. 4)
+    other_episodes: int = 1000  # episodes for each policy in each of the other worlds
     test: int = 150_000  # most trajectories of the test set (appendix B.2)
     test_passes: int = 50  # M on the test set
     num_envs: int = 2000  # worlds at once: so many episodes of the list share a seed, so another number is another list
 
 
 PRESETS = {
-    "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, passes=10, num_envs=200,
+    "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, other_episodes=100, passes=10, num_envs=200,
                        weights=Path(__file__).parent / "pretrained"),
-    "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, passes=2, test=12, num_envs=16),
-    "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, passes=20, test=2000, num_envs=300),
+    "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, other_episodes=2, passes=2, test=12, num_envs=16),
+    "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, other_episodes=300, passes=20, test=2000, num_envs=300),
     "laptop": dict(switch_episodes=2000, passes=10, num_envs=1000),
     "paper": {},
 }
-
-
-@dataclass
-class Measurement:
-    """So many episodes of the fixed list, played by one policy in one kind of world."""
-
-    method: str
-    episodes: int
-    seed: int = 0
-    occlusion: float | None = None
-    starts: str | None = None  # other ones than the world's
-    greedy: bool = True
-    switches: bool = False
-
-
-def measurements(cfg, policies, world):
-    """{where it goes in results.json: Measurement} of {(method, seed): path}, in the order in which they are made."""
-    methods = [m for m in METHODS if (m, 0) in policies]
-    todo = {f"success_rate/{m}/{k}": Measurement(m, cfg.episodes, k) for m, k in policies}
-    todo |= {f"occlusion_duration/{m}/{name}": Measurement(m, cfg.sweep_episodes, occlusion=seconds)
-             for m in methods if METHODS[m].reads != "s" for name, seconds in DURATIONS.items()}
-    for m in [m for m in ("priv_on_state", "est_uncertainty") if m in methods]:
-        others = [starts for starts in STARTS if starts != world.starts]
-        todo |= {f"starts/{starts}/{m}": Measurement(m, cfg.episodes, starts=starts) for starts in others}
-        todo[f"contact_switches/{m}"] = Measurement(m, cfg.switch_episodes, switches=True)
-    if "est_uncertainty" in methods:
-        todo["sampled_actions/est_uncertainty"] = Measurement("est_uncertainty", cfg.episodes, greedy=False)
-    return todo
 
 
 def trained(cfg):
@@ -121,9 +94,8 @@ class Players:
         torch.manual_seed(seed)
         method = METHODS[m.method]
         estimator = self.estimator(method.estimator)
-        world = replace(self.world, starts=m.starts or self.world.starts)
-        env = stacks.make(method, self.cfg.num_envs, estimator, self.cfg.passes, m.occlusion, world=world)
-        env = film.Recorded(env)
+        num, world = min(m.episodes, self.cfg.num_envs), m.world or self.world
+        env = film.Recorded(stacks.make(method, num, estimator, self.cfg.passes, m.occlusion, world=world))
         return *episodes.play(env, self.policy(m.method, m.seed), seed, m.greedy), env
 
     def measure(self, m, progress, name):
@@ -177,6 +149,8 @@ def draw(run, players, results, done):
         if {*methods} & {*results["estimator_ablation"], *results["success_rate"]}:
             plots.validation_loss(cfg.roots, name, run.dir / f"{name}.png")
     plots.sim(run.dir / "sim.png", players.world)
+    if results["other_worlds"]:
+        plots.other_worlds(results, run.dir / "other_worlds.png")
     if results["occlusion_duration"]:
         plots.occlusion_duration(results["occlusion_duration"], run.dir / "occlusion_duration.png")
 
@@ -235,9 +209,7 @@ def main(cfg):
 
     results = statistics.summarise(done)
     save_json(run.dir / "results.json", results)
-    sections = (tables.beside_paper, tables.estimator_ablation, tables.success_rate, tables.occlusion_duration, tables.further)
-    text = "\n\n".join(section(results) for section in sections) + "\n"
-    write_atomic(run.dir / "tables.md", lambda path: path.write_text(text))
+    write_atomic(run.dir / "tables.md", lambda path: path.write_text(tables.every(results)))
     save_json(run.dir / "results.json", results | draw(run, players, results, done))
     run.finish(["results.json", "tables.md"])
     report(run)

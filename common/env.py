@@ -43,7 +43,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
         self.tolerance, self.near_share = 1.0, 0.0
-        self.worlds = Worlds(num_envs, sub_steps, threads=threads, size=self.world.box)
+        self.worlds = Worlds(num_envs, sub_steps, threads=threads, size=self.world.box, surface=self.world.surface)
         self._steps = np.zeros(num_envs, int)
 
     box, pusher = property(attrgetter("worlds.box")), property(attrgetter("worlds.pusher"))
@@ -78,6 +78,9 @@ class PushVectorEnv(gym.vector.VectorEnv):
     def _start(self, worlds, **given):
         box, pusher = self._draw_start(len(worlds), given.pop("box", None), given.pop("pusher", None))
         drawn = {name: self.np_random.uniform(*limits, len(worlds)) for name, limits in self.world.dynamics.items()}
+        polar = self.world.support_offset, (-np.pi, np.pi)
+        distance, angle = (self.np_random.uniform(*limits, len(worlds)) for limits in polar)
+        drawn |= {"support_x": distance * np.cos(angle), "support_y": distance * np.sin(angle)}
         drawn["mu_static"] = np.maximum(drawn["mu_static"], (drawn | given)["mu_dynamic"])
         self.worlds.place(worlds, box, pusher, drawn | given)
         self._steps[worlds] = 0
@@ -91,7 +94,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
             one, value = shapes[name], np.asarray(value, float)
             if value.shape not in (one, (self.num_envs, *one)):
                 raise ValueError(f"reset option {name!r} has shape {value.shape}, not {(self.num_envs, *one)} or {one}")
-            if not np.isfinite(value).all() or name in DYNAMICS and value.min() < 0 or (
+            if not np.isfinite(value).all() or name in self.world.dynamics and value.min() < 0 or (
                     name in ("mass", "limit_surface_c") and value.min() == 0):
                 raise ValueError(f"reset option {name!r} is {value}: not finite, or out of its physical range")
             given[name] = np.array(np.broadcast_to(value, (self.num_envs, *one)))

@@ -1,4 +1,6 @@
 """The observation model O of sec. 3.2: o = scale(clip(hold(s + bias + noise))) and the occlusion flag xi."""
+from collections import deque
+
 import numpy as np
 
 from common import task
@@ -11,13 +13,15 @@ class ObservationModel:
 
     Correlated noise (the bias) is drawn per episode, uncorrelated noise per step, and occlusions, all as in `world`. An
     occlusion holds the last noisy box pose, bit for bit, with xi at 1, for N(10, 5^2) s or for `occlusion` s: 0 for none,
-    math.inf for "until the end". The pusher is exact. Each `step` takes the same number of draws from its own stream,
-    whatever the states are: with the same seed noise and occlusions of the same step are the same, up to the first `reset`.
+    math.inf for "until the end". The pusher is exact. In a task.Other the camera may be late and the force have a gain. Each
+    `step` takes the same number of draws from its own stream, whatever the states are: with the same seed noise and
+    occlusions of the same step are the same, up to the first `reset`.
     """
 
     def __init__(self, num, seed=0, occlusion=None, world=World()):
         self.num, self.occlusion, self.world = num, occlusion, world
         self.bias, self.held = np.zeros((num, 5), np.float32), np.zeros((num, 3), np.float32)  # SI units
+        self.frames = deque(np.zeros((world.late, num, 3)))  # the boxes that the camera has not shown yet
         self.hidden = np.zeros(num)  # frames for which the running occlusion still hides the box
         self.seed(seed)
 
@@ -26,6 +30,8 @@ class ObservationModel:
 
     def reset(self, worlds, state):
         """First observations (k, 9) of new episodes in `worlds` (k,) from states (k, 7): never occluded."""
+        for frame in self.frames:  # the box was at rest before
+            frame[worlds] = state[:, :3]
         noise, frames = self._draw(self._rng_reset, len(worlds))
         self.bias[worlds] = self._rng_reset.standard_normal((len(worlds), 5), np.float32) * self.world.bias
         noisy = self._add(state, self.bias[worlds] + noise)
@@ -35,6 +41,9 @@ class ObservationModel:
     def step(self, state):
         """Observations (N, 9) of states (N, 7), float32: the scaled state (8) with the box held in an occlusion, and xi."""
         noise, frames = self._draw(self._rng_step, self.num)
+        if self.world.late:
+            self.frames.append(state[:, :3].copy())
+            state = np.concatenate([self.frames.popleft(), state[:, 3:]], 1)
         occluded = self.hidden > 0
         noisy = self._add(state, self.bias + noise)
         self.held = noisy[:, :3] = np.where(occluded[:, None], self.held, noisy[:, :3])
@@ -52,9 +61,9 @@ class ObservationModel:
         seconds = seconds if self.occlusion is None else self.occlusion
         return noise, np.where(start < self.world.occlusion_start, np.maximum(np.round(task.RATE * seconds), 0), 0)
 
-    @staticmethod
-    def _add(state, error):
+    def _add(self, state, error):
         noisy = state.astype(np.float32)
+        noisy[:, 5:] *= self.world.gain
         noisy[:, [0, 1, 2, 5, 6]] += error
         return noisy
 

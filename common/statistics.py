@@ -46,7 +46,7 @@ def spread(values):
 
 def summarise(done):
     """results.json from {section/key/...: one number an episode, or an error table}, as 05 measures them."""
-    results = {"occlusion_duration": {}}
+    results = {"occlusion_duration": {}, "other_worlds": {}}
     kinds = {"estimator_ablation": dict, "success_rate": list, "contact_switches": lambda v: spread(v) | {"episodes": len(v)}}
     for name, values in done.items():
         *keys, last = name.split("/")

@@ -81,12 +81,33 @@ def occlusion_duration(results):
     return title + "\n\n" + aligned(header, rows)
 
 
+def other_worlds(results):
+    """Success where one thing is other than in training; the first row is the fixed list of sec. 5.2."""
+    worlds = results.get("other_worlds")
+    if not worlds:
+        return ""
+    methods = list(next(iter(worlds.values())))
+    rows = [[row, *(percent(rates[m]) if m in rates else "" for m in methods)]
+            for row, rates in ({"as trained": results["success_rate"]} | worlds).items()]
+    episodes = next(iter(worlds.values()))[methods[0]]["episodes"]
+    title = f"Success in other worlds, one thing changed at a time, {episodes:,} episodes each"
+    return f"{title}\n\n{aligned(['world', *methods], rows)}"
+
+
 def further(results):
     """Other starts, and sampled actions."""
     sections = {f"starts {name}": rates for name, rates in results.get("starts", {}).items()}
     sections["actions sampled"] = results.get("sampled_actions", {})
     return "\n".join(f"- {method}, {what}: success {percent(rate)}" for what, rates in sections.items()
                      for method, rate in rates.items())
+
+
+SECTIONS = (beside_paper, estimator_ablation, success_rate, occlusion_duration, other_worlds, further)
+
+
+def every(results):
+    """tables.md: what there is of every section."""
+    return "\n\n".join(filter(None, (section(results) for section in SECTIONS))) + "\n"
 
 
 def robot(summary):

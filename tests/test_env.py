@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from common import draw, geometry, task
 from common.env import PushEnv, PushVectorEnv
 from common.simulator import SUB_STEPS
-from common.task import World
+from common.task import Other, World
 
 C = [0.042, 0.060, 0.078]  # m: even pressure, between, four corners
 G = task.GRAVITY
@@ -152,6 +152,59 @@ def quasi_static(offset, mu_pusher, speed, c, seconds, dt=5e-4):
         box += dt * np.stack([cos * normal - sin * tangential, sin * normal + cos * tangential, omega], 1)
         pusher[:, 0] += speed * dt
     return box
+
+
+def test_a_push_through_the_centre_of_friction_turns_nothing():
+    offset, tilt = np.array([[0.0, 0.02], [0.02, -0.03], [0.01, 0.0], [-0.03, 0.04]]), np.array([0, np.pi / 2, np.pi, -np.pi / 2])
+    along = np.array([geometry.rotation(angle) @ d for angle, d in zip(tilt, offset)])  # in the world's frame
+    half = np.where(np.arange(4) % 2 == 0, *HALF_BOX)
+    pusher = np.stack([-half - task.RADIUS, along[:, 1]], 1)
+    poses = np.pad(tilt[:, None], ((0, 0), (2, 0)))
+    env = start(4, box=poses, pusher=pusher, mu_pusher=0, support_x=offset[:, 0], support_y=offset[:, 1])
+    play(env, [10, REST], 30)
+    assert env.box[:, 0] == pytest.approx(0.1, abs=0.004) and np.abs(env.box - poses)[:, 1:].max() < 1e-3
+    centred = start(4, box=poses, pusher=pusher, mu_pusher=0)
+    play(centred, [10, REST], 30)
+    assert (np.abs(centred.box - poses)[[0, 1, 3], 2] > 0.2).all()
+
+
+def test_a_box_spins_about_its_centre_of_friction():
+    env = start(box=[0.1, 0, 0.3], mu_dynamic=0.15, support_x=0.02, support_y=-0.01)
+    launch(env, (0, 0), 8.0)
+    play(env, REST, 30)
+    moved = env.box[0, :2] + geometry.rotation(env.box[0, 2]) @ [0.02, -0.01]
+    assert moved == pytest.approx([0.1, 0] + geometry.rotation(0.3) @ [0.02, -0.01], abs=1e-9) and env.box[0, 2] > 0.6
+    env.reset(options=MIDDLE | {"box": [0.1, 0, 0.3], "pusher": [-0.1, 0], "support_x": 0.0, "support_y": 0.0, "mu_dynamic": 0.15})
+    launch(env, (0, 0), 8.0)
+    play(env, REST, 30)
+    assert env.box[0, :2] == pytest.approx([0.1, 0], abs=1e-9)  # nothing of it stays
+
+
+@pytest.mark.parametrize("k", [1.5, 2.0, 4.0])
+def test_a_frictionless_push_turns_the_box_along_the_normal_of_its_limit_surface(k):
+    offset = np.array([0.005, 0.02, -0.045])
+    env = PushVectorEnv(3, world=Other(surface=k))
+    env.reset(options=MIDDLE | {"box": [0, 0, 0], "pusher": west(offset), "mu_pusher": 0.0, "restitution": 0.0})
+    states = play(env, [8, REST], 8)
+    turn, way = states[-1, :, 2] - states[3, :, 2], np.linalg.norm(states[-1, :, :2] - states[3, :, :2], axis=1)
+    middle = (states[-1, :, 2] + states[3, :, 2]) / 2  # the lever of the force changes as the box turns
+    lever = (np.cos(middle) * (states[[3, -1], :, 4] - states[[3, -1], :, 1]).mean(0)
+             - np.sin(middle) * (states[[3, -1], :, 3] - states[[3, -1], :, 0]).mean(0))
+    expected = -np.sign(offset) * (np.abs(lever) / 0.060)**(k - 1) / 0.060  # of turn by way
+    assert turn / way == pytest.approx(expected, rel=0.08, abs=0.01)
+
+
+@pytest.mark.parametrize("k", [1.5, 4.0])
+def test_a_free_slide_and_spin_on_another_limit_surface(k):
+    mu, c, p, v, w, x, theta, dt = 0.2, 0.060, k / (k - 1), 0.3, 3.0, 0.0, 0.0, 1e-5
+    while (n := (v**p + (c * w)**p)**(1 / p)) > 2 * mu * G * dt:
+        x, theta = x + v * dt, theta + w * dt
+        v, w = max(v - mu * G * (v / n)**(p - 1) * dt, 0), max(w - mu * G * c / GYRATION * (c * w / n)**(p - 1) * dt, 0)
+    env = PushVectorEnv(1, world=Other(surface=k))
+    env.reset(options=MIDDLE | {"box": [0, 0, 0], "pusher": [-1, -1], "mu_dynamic": mu})
+    launch(env, (0.3, 0), 3.0)
+    play(env, REST, 30)
+    assert env.box[0, [0, 2]] == pytest.approx([x, theta], rel=0.06)
 
 
 @pytest.mark.parametrize("seconds", [1, 2])
@@ -365,7 +418,7 @@ def test_dynamics_are_drawn_anew_from_the_table(name):
     assert first.mean() == pytest.approx((low + high) / 2, abs=0.03 * (high - low))
     env.reset()
     assert not (env.dynamics[name] == first).any()
-    assert np.abs(np.corrcoef(list(env.dynamics.values())) - np.eye(len(RANGES))).max() < 0.1
+    assert np.abs(np.corrcoef([env.dynamics[other] for other in RANGES]) - np.eye(len(RANGES))).max() < 0.1
 
 
 def test_reset_takes_any_subset_of_the_options():

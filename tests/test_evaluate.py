@@ -2,6 +2,7 @@ import csv
 import importlib
 import json
 import math
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import cv2
@@ -10,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from common import film, networks, plots, stacks, statistics, tables, task, weights
+from common import film, measurements, networks, plots, stacks, statistics, tables, task, weights
 from common.task import World
 
 evaluate = importlib.import_module("05_evaluate")
@@ -156,6 +157,30 @@ def test_results_have_the_published_layout():
     assert all(set(row) == {"priv_on_state", "est_uncertainty"} for row in results["starts"].values())
 
 
+def test_other_worlds_differ_in_one_thing():
+    world = task.World(mass=(2.0, 2.5))
+    base = task.Other(**asdict(world))
+    for row, other in measurements.other_worlds(world).items():
+        changed = [name for name in asdict(other) if getattr(other, name) != getattr(base, name)]
+        assert len(changed) == 1, row
+        assert measurements.of_sensing(other, world) == (row.partition("=")[0] in ("noise", "bias", "force", "late"))
+    rows = measurements.other_worlds(world)
+    assert rows["c=0.042"].dynamics["limit_surface_c"] == pytest.approx((0.0422, 0.0422), abs=1e-4)
+    assert rows["c=0.060"].dynamics["limit_surface_c"] == (0.060, 0.060) and rows["mu=0.3-0.6"].mu_dynamic == (0.3, 0.6)
+    assert rows["box=-2cm"].box == pytest.approx((0.10, 0.10, 0.07)) and rows["noise=2x"].noise[3] == 1.4
+    assert "box=+2cm_wide" not in measurements.other_worlds(task.World(box=(0.2, 0.21, 0.07)))  # no room
+
+
+def test_another_world_is_played(short):
+    play, rows = players(), measurements.other_worlds(task.World())
+    base = first_rows(play, "est")[1]
+    for row in ("mass=1-1.5", "c=0.078", "surface=4", "support_offset=8mm"):
+        env = play.chunk(measurements.Measurement("est", 6, world=rows[row]), 0)[2].unwrapped
+        assert env.world == rows[row]
+        same = [name for name in base if np.array_equal(env.dynamics[name], base[name])]
+        assert len(base) - len(same) == {"surface=4": 0, "support_offset=8mm": 2}.get(row, 1)
+
+
 def test_several_seeds_give_mean_and_std_beside_the_first_seeds_interval():
     done = made_up(seeds=3)
     row = statistics.summarise(done)["success_rate"]["est"]
@@ -167,7 +192,7 @@ def test_several_seeds_give_mean_and_std_beside_the_first_seeds_interval():
 
 def test_tables_line_up_and_hold_every_method():
     results = statistics.summarise(made_up(seeds=2))
-    for section in (tables.beside_paper, tables.estimator_ablation, tables.success_rate, tables.occlusion_duration):
+    for section in tables.SECTIONS[:-1]:
         text = section(results)
         lines = [line for line in text.splitlines() if line.startswith("|")]
         assert len({len(line) for line in lines}) == 1 and len(lines[0]) <= 130
@@ -187,8 +212,7 @@ def test_tables_leave_out_what_was_not_measured(others):
     results = json.loads(json.dumps(statistics.summarise(made_up(methods=methods))))
     assert list(results["success_rate"]) == methods and "minus_est_uncertainty" not in results["success_rate"][methods[0]]
     assert list(results["occlusion_duration"]) == list(results["occlusion_loss"]) == others
-    text = "\n\n".join(section(results) for section in (
-        tables.beside_paper, tables.estimator_ablation, tables.success_rate, tables.occlusion_duration, tables.further))
+    text = tables.every(results)
     told = {m for m in stacks.METHODS if f"| {m} " in text or f"- {m}," in text or f" of {m} " in text}
     assert told == set(methods)
 
@@ -243,11 +267,12 @@ def test_every_figure_is_drawn_with_whatever_runs_there_are(tmp_path, short):
     results = statistics.summarise(made_up())
     plots.occlusion_duration(results["occlusion_duration"], tmp_path / "occlusion_duration.png")
     plots.sim(tmp_path / "sim.png")
+    plots.other_worlds(results, tmp_path / "other_worlds.png")
     pair = {m: play.episode(evaluate.Measurement(m, 6, occlusion=math.inf), 1)
             for m in ("est_uncertainty", "priv_on_estimate")}
     plots.trajectory_with_uncertainty(pair, tmp_path / "trajectory.png", 3, 6, 1)
     images = sorted(tmp_path.glob("*.png"))
-    assert len(images) == 16 and all(min(shape(path)[:2]) >= 350 for path in images)
+    assert len(images) == 17 and all(min(shape(path)[:2]) >= 350 for path in images)
     assert not list(tmp_path.rglob(".*"))  # nothing half-written
 
 

@@ -6,7 +6,7 @@ import pytest
 from common import task
 from common.env import PushVectorEnv
 from common.observation import ObservationModel, Observed
-from common.task import World
+from common.task import Other, World
 
 VISION = np.s_[..., :4]  # the box in an observation
 
@@ -114,6 +114,31 @@ def test_noise_bias_and_force_are_the_worlds():
     bias, noise = e.mean(0), e - e.mean(0)
     np.testing.assert_allclose(noise.std((0, 1)) * np.sqrt(steps / (steps - 1)), world.noise, rtol=0.02)
     np.testing.assert_allclose(bias.std(0), np.hypot(world.bias, np.array(world.noise) / np.sqrt(steps)), rtol=0.05)
+
+
+@pytest.mark.parametrize("late", [1, 2])
+def test_a_late_camera_shows_the_box_of_before_and_the_force_of_now(late):
+    states = moving(40, 30)
+    now, then = (ObservationModel(30, 0, world=Other(late=k)).trajectory(states) for k in (0, late))
+    behind = states.copy()
+    behind[..., :3] = states[np.maximum(np.arange(40) - late, 0), :, :3]
+    np.testing.assert_array_equal(then, ObservationModel(30, 0).trajectory(behind))
+    np.testing.assert_array_equal(then[..., 4:], now[..., 4:])
+
+
+def test_a_late_camera_forgets_the_episode_before():
+    model, states = ObservationModel(4, 0, 0, Other(late=2)), moving(6, 4)
+    model.trajectory(states)
+    model.reset(np.array([1]), states[:1, 1] + 0.01)
+    off = errors(model.step(states[1] + 0.01), states[0] + 0.01)
+    assert np.abs(off[1, :2]).max() < 0.02 < np.abs(off[[0, 2, 3], :2]).max()
+
+
+def test_the_force_has_a_gain():
+    states = moving(20, 50)
+    one, other = (ObservationModel(50, 0, world=Other(gain=gain, max_force=99.0)).trajectory(states) for gain in (1.0, 0.7))
+    np.testing.assert_array_equal(one[..., :6], other[..., :6])
+    np.testing.assert_allclose((one - other)[..., 6:8] * 99, 0.3 * states[..., 5:], atol=1e-4)
 
 
 def test_until_the_end():
