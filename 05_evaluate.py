@@ -44,7 +44,8 @@ class Config(command.Reader):
 PRESETS = {
     "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, other_episodes=100, passes=10, num_envs=200,
                        weights=Path(__file__).parent / "pretrained"),
-    "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, other_episodes=2, passes=2, test=12, num_envs=16),
+    "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, other_episodes=2, passes=2, test=12,
+                  num_envs=16),
     "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, other_episodes=300, passes=20, test=2000, num_envs=300),
     "laptop": dict(switch_episodes=2000, passes=10, num_envs=1000),
     "paper": {},
@@ -99,14 +100,18 @@ class Players:
         return *episodes.play(env, self.policy(m.method, m.seed), seed, m.greedy), env
 
     def measure(self, m, progress, name):
-        """One number an episode: 1 for success, or its contact switches."""
+        """What was measured of each episode: 1 for success, its contact switches, or its errors (trajectories.in_the_loop)."""
         values = []
         for number in range(math.ceil(m.episodes / self.cfg.num_envs)):
             success, length, env = self.chunk(m, number)
+            told = success.astype(int).tolist()
             if m.switches:
-                success = [geometry.contact_switches(env.episode(i, n)["state"], self.world.box) for i, n in enumerate(length)]
-            values += [int(x) for x in success[:m.episodes - len(values)]]
-            progress.set_postfix_str(f"{name} {np.mean(values):{'.1f' if m.switches else '.1%'}}", refresh=False)
+                told = [geometry.contact_switches(env.episode(i, n)["state"], self.world.box) for i, n in enumerate(length)]
+            if m.errors:
+                told = trajectories.in_the_loop(env.rows, length).tolist()
+            values += told[:m.episodes - len(values)]
+            mean = "" if m.errors else f"{np.mean(values):{'.1f' if m.switches else '.1%'}}"
+            progress.set_postfix_str(f"{name} {mean}", refresh=False)
             progress.update(min(self.cfg.num_envs, m.episodes - number * self.cfg.num_envs))
         return values
 

@@ -21,6 +21,7 @@ class Measurement:
     world: World | None = None  # another one than the nets'
     greedy: bool = True
     switches: bool = False
+    errors: bool = False
 
 
 def measurements(cfg, policies, world):
@@ -36,6 +37,7 @@ def measurements(cfg, policies, world):
     todo |= {f"other_worlds/{row}/{m}": Measurement(m, cfg.other_episodes, world=other)
              for row, other in other_worlds(world).items() for m in methods
              if METHODS[m].estimator or METHODS[m].reads == "s" and not of_sensing(other, world)}
+    todo |= {f"in_the_loop/{m}": Measurement(m, cfg.episodes, errors=True) for m in methods if METHODS[m].estimator}
     if "est_uncertainty" in methods:
         todo["sampled_actions/est_uncertainty"] = Measurement("est_uncertainty", cfg.episodes, greedy=False)
     return todo

@@ -83,6 +83,21 @@ def pose_errors(q_hat, q, occluded, mask):
     return {name: (terms * chosen).sum(1) for name, chosen in steps.items()}
 
 
+def in_the_loop(rows, length):
+    """Errors of the beliefs while a policy played: film.Recorded's rows, lengths (N,) of the episodes.
+
+    (N, 7) sums over an episode's steps: those of pose_errors, and how many of x, y, sin and cos, as shares of the four, lie
+    within 1 and 2 of their standard deviations.
+    """
+    state, o, belief = (np.stack([row[name] for row in rows[:length.max()]]) for name in ("state", "o", "belief"))
+    q = symmetry.mirror(task.scale(state), symmetry.signs(o[0]))[..., :4]
+    mask = (np.arange(len(q))[:, None] < length).astype(np.float32)
+    sums = pose_errors(*map(torch.as_tensor, (belief[..., :4], q, o[..., 8], mask)))["all"]
+    off = np.abs(belief[..., :4] - q)
+    within = [((off <= k * belief[..., 8:]).mean(-1) * mask).sum(0) for k in (1, 2)]
+    return np.concatenate([sums, within]).T
+
+
 @torch.no_grad()
 def measure(data, limit, size, seed, device, predict, world=task.World()):
     """`pose_errors` of predict(o) (T, B, 4) over at most `limit` trajectories, with the same noise for every predict."""

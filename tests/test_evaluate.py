@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from common import film, measurements, networks, plots, stacks, statistics, tables, task, weights
+from common import film, measurements, networks, plots, stacks, statistics, tables, task, trajectories, weights
 from common.task import World
 
 evaluate = importlib.import_module("05_evaluate")
@@ -137,6 +137,8 @@ def made_up(seeds=1, methods=stacks.METHODS):
     cfg = evaluate.Config(episodes=40, sweep_episodes=20, switch_episodes=10)
     for name, m in evaluate.measurements(cfg, {(method, k): None for method in methods for k in range(seeds)}, World()).items():
         done[name] = rng.integers(0, 2, m.episodes).tolist()
+        if m.errors:
+            done[name] = (rng.uniform(0, 1, (m.episodes, 7)) + [9, 0, 0, 0, 0, 0, 0]).tolist()
     return done
 
 
@@ -155,6 +157,34 @@ def test_results_have_the_published_layout():
     assert set(results["contact_switches"]["priv_on_state"]) == {"mean", "std", "episodes"}
     assert set(results["starts"]) == {"centre", "inner"}
     assert all(set(row) == {"priv_on_state", "est_uncertainty"} for row in results["starts"].values())
+
+
+def test_errors_in_the_loop_are_those_of_the_beliefs_before_the_actions(short):
+    _, length, env = players().chunk(evaluate.Measurement("est_uncertainty", 6), 0)
+    sums = trajectories.in_the_loop(env.rows, length)
+    for world, n in enumerate(length):
+        episode = env.episode(world, n)
+        state, belief = episode["state"][:n], episode["belief"][:n]
+        q_hat, off = task.unscale_pose(belief[:, :4]), np.abs(belief[:, :4] - task.scale(state)[:, :4])
+        l2, angle = np.linalg.norm(q_hat[:, :2] - state[:, :2], axis=1), np.abs(task.wrap(q_hat[:, 2] - state[:, 2]))
+        shares = [(off <= k * belief[:, 8:]).mean(1).sum() for k in (1, 2)]
+        expected = [n, l2.sum(), (l2**2).sum(), angle.sum(), (angle**2).sum(), *shares]
+        assert sums[world] == pytest.approx(expected, rel=1e-4, abs=1e-5)
+
+
+def test_a_table_of_errors_in_the_loop():
+    rng = np.random.default_rng(0)
+    steps = rng.integers(50, 300, 500)
+    off = np.abs(rng.standard_normal(500))  # of a normal distribution, the same at each of an episode's steps
+    sums = steps * np.stack([np.ones(500), *np.full((4, 500), [[0.004], [0.004**2], [0.02], [0.02**2]]), off < 1, off < 2])
+    sums = sums.T
+    row = statistics.in_the_loop(sums.tolist())
+    assert row["trans_mean_l2_mm"] == pytest.approx(4.0) and row["rot_mean_abs_deg"] == pytest.approx(np.rad2deg(0.02))
+    assert row["within_1_sigma"] == pytest.approx(0.683, abs=0.05) and row["within_2_sigma"] == pytest.approx(0.954, abs=0.03)
+    unknown = statistics.in_the_loop((sums * [1, 1, 1, 1, 1, 0, 0]).tolist())
+    assert unknown["within_1_sigma"] is None and unknown["episodes"] == 500
+    text = tables.in_the_loop({"in_the_loop": {"est": row, "est_mse": unknown}})
+    assert "| est     | 4.00 [4.00, 4.00] |" in text and not tables.in_the_loop({})
 
 
 def test_other_worlds_differ_in_one_thing():

@@ -202,6 +202,7 @@ def test_results_have_every_number(study):
     for rate in rates + [rate for row in results["occlusion_duration"].values() for rate in row.values()]:
         assert 0 <= rate["low"] <= rate["mean"] <= rate["high"] <= 1 and rate["high"] > rate["low"]
     assert {rate["episodes"] for rate in rates} == {16}
+    assert results["in_the_loop"].keys() == {"est_uncertainty", "est", "est_mse", "priv_on_estimate"}
     estimating = {"est_uncertainty", "est", "est_mse", "priv_on_estimate"}
     assert results["other_worlds"].keys() == {
         "c=0.042", "c=0.060", "c=0.078", "support_offset=8mm", "mass=1-1.5", "mass=5-6", "mu=0.05-0.1", "mu=0.3-0.6", "box=-2cm",
