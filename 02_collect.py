@@ -70,9 +70,8 @@ class Drifting(EpisodeWrapper):
         self.error = keep * self.error + np.sqrt(1 - keep**2) * self.draw()
         return self.off_its_pose(state_of(infos), self.error)
 
-    @staticmethod
-    def off_its_pose(state, error):
-        return task.scale(np.concatenate([state[:, :3] + error, state[:, 3:]], 1))
+    def off_its_pose(self, state, error):
+        return self.unwrapped.scaled(np.concatenate([state[:, :3] + error, state[:, 3:]], 1))
 
 
 def jobs(cfg, checkpoints):

@@ -61,10 +61,13 @@ def train(run, cfg, train_set, validation_set, device):
         validation=cfg.validation)
 
 
-def error_against_passes(estimator, data, cfg, device):
+def error_against_passes(estimator, data, cfg, device, world):
     """Errors on the validation set for each M of GRID; without dropout for M = 1, as every pass is the same."""
     def sums(m):
-        return trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, lambda o: estimator.predict(o, passes=m)[0])
+        def predict(o):
+            return estimator.predict(o, passes=m)[0]
+
+        return trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, predict, world)
 
     done = {m: sums(m) for m in (GRID if estimator.dropout else (1,))}
     return {m: statistics.error_table(measured) for m, measured in done.items() if measured}
@@ -85,7 +88,7 @@ def main(cfg):
         if not train(run, cfg, train_set, validation_set, device):
             return
         estimator = weights.load(networks.Estimator, run.dir / "estimator.safetensors", device)
-        errors = error_against_passes(estimator, validation_set, cfg, device)
+        errors = error_against_passes(estimator, validation_set, cfg, device, run.world)
         if ranks.RANK:
             continue
         save_json(run.dir / "passes.json", errors)

@@ -6,8 +6,8 @@ Reads pi_priv (01), the test set (02), the estimators (03), every finished seed 
 all: those in the folder --weights, which is pretrained/ with the preset pretrained, and the others of the same preset. Writes
 runs/<preset>/05_evaluate/seed<k>/: results.json, tables.md, film.mp4, film.gif, and as PNG the figures of sec. 5 and of the
 appendix: success_rate, occlusion_duration, trajectory_with_uncertainty, sim, success_rate_priv, likelihood_loss, mse_loss,
-bc_loss. What is not trained is left out; after a further training the same command measures what is new, and no more
-(measurements.json). Resumes after the last finished measurement.
+bc_loss; and other_worlds. What is not trained is left out; after a further training the same command measures what is new,
+and no more (measurements.json). Resumes after the last finished measurement.
 """
 import hashlib
 import math
@@ -19,12 +19,10 @@ import numpy as np
 
 from common import command, film, plots, ranks, runs, statistics, tables, task, trajectories
 from common.files import load_json, save_json, write_atomic
-from common.players import LIST, Measurement, Players
+from common.measurements import Measurement, measurements
+from common.players import LIST, Players
 from common.progress import bar
 from common.stacks import ESTIMATORS, METHODS
-from common.task import STARTS
-
-DURATIONS = {"0": 0.0, "2.5": 2.5, "5": 5.0, "10": 10.0, "full": math.inf}  # s; the paper's own grid is in its plot only
 
 
 @dataclass
@@ -33,33 +31,21 @@ class Config(command.Reader):
     sweep_episodes: int = 2000  # episodes for each point of the occlusion-duration sweep (sec. 5.3)
     switch_episodes: int = 20_000  # episodes for the contact switches (sec. 5.4)
     passes: int = 50  # M, stochastic passes of the estimator in the loop (sec. 4)
+    other_episodes: int = 1000  # episodes for each policy in each of the other worlds
     test: int = 150_000  # most trajectories of the test set (appendix B.2)
     test_passes: int = 50  # M on the test set
     num_envs: int = 2000  # worlds at once: so many episodes of the list share a seed, so another number is another list
 
 
 PRESETS = {
-    "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, passes=10, num_envs=200,
+    "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, other_episodes=100, passes=10, num_envs=200,
                        weights=Path(__file__).parent / "pretrained"),
-    "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, passes=2, test=12, num_envs=16),
-    "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, passes=20, test=2000, num_envs=300),
+    "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, other_episodes=2, passes=2, test=12,
+                  num_envs=16),
+    "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, other_episodes=300, passes=20, test=2000, num_envs=300),
     "laptop": dict(switch_episodes=2000, passes=10, num_envs=1000),
     "paper": {},
 }
-
-
-def measurements(cfg, policies, world):
-    """{where it goes in results.json: Measurement} of {(method, seed): path}, in the order in which they are made."""
-    methods = [m for m in METHODS if (m, 0) in policies]
-    todo = {f"success_rate/{m}/{k}": Measurement(m, cfg.episodes, k) for m, k in policies}
-    todo |= {f"occlusion_duration/{m}/{name}": Measurement(m, cfg.sweep_episodes, occlusion=seconds)
-             for m in methods if METHODS[m].reads != "s" for name, seconds in DURATIONS.items()}
-    for m in [m for m in ("priv_on_state", "est_uncertainty") if m in methods]:
-        todo |= {f"starts/{starts}/{m}": Measurement(m, cfg.episodes, starts=starts) for starts in STARTS if starts != world.starts}
-        todo[f"contact_switches/{m}"] = Measurement(m, cfg.switch_episodes, switches=True)
-    if "est_uncertainty" in methods:
-        todo["sampled_actions/est_uncertainty"] = Measurement("est_uncertainty", cfg.episodes, greedy=False)
-    return todo
 
 
 def trained(cfg):
@@ -96,7 +82,7 @@ def estimator_errors(cfg, players, test, kind):
     def predict(o):
         return o[..., :4] if kind == "vision" else players.estimator(kind).predict(o, passes=cfg.test_passes)[0]
 
-    sums = trajectories.measure(test, cfg.test, 100, LIST + cfg.seed, players.device, predict)
+    sums = trajectories.measure(test, cfg.test, 100, LIST + cfg.seed, players.device, predict, players.world)
     return statistics.error_table(sums) if sums else None
 
 
@@ -120,7 +106,8 @@ def measure(run, players, todo, test, keys, kept):
     for jobs in trajectories.batches(chunks, ranks.COUNT):
         for (name, _), more in zip(jobs, ranks.spread(jobs, lambda job: players.measure(todo[job[0]], job[1]))):
             values[name] += more
-            progress.set_postfix_str(f"{name} {np.mean(values[name]):{'.1f' if todo[name].switches else '.1%'}}", refresh=False)
+            mean = "" if todo[name].errors else f"{np.mean(values[name]):{'.1f' if todo[name].switches else '.1%'}}"
+            progress.set_postfix_str(f"{name} {mean}", refresh=False)
             progress.update(len(more))
             if len(values[name]) == todo[name].episodes:
                 keep(name, values[name])
@@ -151,7 +138,9 @@ def draw(run, players, results, done):
     for name, (_, methods, _) in plots.LOSSES.items():
         if {*methods} & {*results["estimator_ablation"], *results["success_rate"]}:
             plots.validation_loss(cfg.roots, name, run.dir / f"{name}.png")
-    plots.sim(run.dir / "sim.png")
+    plots.sim(run.dir / "sim.png", players.world)
+    if results["other_worlds"]:
+        plots.other_worlds(results, run.dir / "other_worlds.png")
     if results["occlusion_duration"]:
         plots.occlusion_duration(results["occlusion_duration"], run.dir / "occlusion_duration.png")
 
@@ -162,14 +151,14 @@ def draw(run, players, results, done):
         first = cases[0] if cases else 0
         plots.trajectory_with_uncertainty(
             {m: players.episode(Measurement(m, len(ours), occlusion=math.inf), first) for m in pair},
-            run.dir / "trajectory_with_uncertainty.png", len(cases), len(ours), first)
+            run.dir / "trajectory_with_uncertainty.png", len(cases), len(ours), first, players.world.box)
         shown["trajectory_with_uncertainty"] = {"episode": first, "cases": len(cases), "episodes": len(ours)}
     if "est_uncertainty" in results["success_rate"]:
         success, length, env = players.chunk(Measurement("est_uncertainty", cfg.episodes), 0)
         hidden = np.array([env.episode(i, n)["o"][:, 8].sum() for i, n in enumerate(length)])
         long = np.flatnonzero(success & (hidden >= 5 * task.RATE))  # the first success with 5 s of occlusion
         world = int(long[0]) if long.size else 0
-        film.write(env.episode(world, length[world]), run.dir / "film.mp4", run.dir / "film.gif")
+        film.write(env.episode(world, length[world]), run.dir / "film.mp4", run.dir / "film.gif", players.world)
         shown["film"] = {"episode": world}
     return shown
 
@@ -200,9 +189,7 @@ def main(cfg):
     done = {name: kept[key] for name, key in keys.items()}
     results = statistics.summarise(done)
     save_json(run.dir / "results.json", results)
-    sections = (tables.beside_paper, tables.estimator_ablation, tables.success_rate, tables.occlusion_duration, tables.further)
-    text = "\n\n".join(section(results) for section in sections) + "\n"
-    write_atomic(run.dir / "tables.md", lambda path: path.write_text(text))
+    write_atomic(run.dir / "tables.md", lambda path: path.write_text(tables.every(results)))
     save_json(run.dir / "results.json", results | draw(run, players, results, done))
     run.finish(["results.json", "tables.md"])
     report(run)

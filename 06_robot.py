@@ -195,6 +195,9 @@ def main(cfg):
     paths = {"estimator": runs.find(cfg, "03_train_estimator", "estimator.safetensors", "ours"),
              "policy": runs.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty")}
     f, pi = weights.load(networks.Estimator, paths["estimator"]), weights.load(networks.Recurrent, paths["policy"])
+    for name in ("box", "pusher_height", "max_force"):  # which tags, arm, pictures and program are made for
+        if (known := getattr(runs.world_of(cfg, paths.values()), name)) != getattr(World, name):
+            raise UserError(f"--{name.replace('_', '-')} {known}: the robot is made for {getattr(World, name)} only")
     folder = runs.run_folder(cfg.own, "06_robot", None, cfg.seed)
     scenarios = SCENARIOS if cfg.scenario == "all" else (cfg.scenario,)
     if cfg.force and any(runlog.read(folder, other) for other in SCENARIOS if other not in scenarios):

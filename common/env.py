@@ -25,8 +25,8 @@ class PushVectorEnv(gym.vector.VectorEnv):
     Infos: `state` (N, 7) true states in SI units and `success` (N,) of this step. Where an episode ended, `_final_obs` (N,)
     is set, `final_obs` (N, 8) and `final_state` (N, 7) hold its end, and observation and `state` start the next episode.
 
-    Args: world: what is drawn for an episode; starts: other ones than the world's; sub_steps: physics steps a control step;
-    threads: as in simulator.Worlds; they change no bit, and pay from about 2,000 worlds a thread on.
+    Args: world: task.World, what is drawn for an episode; starts: other ones than the world's; sub_steps: physics steps a
+    control step; threads: as in simulator.Worlds; they change no bit, and pay from about 2,000 worlds a thread on.
 
     Attributes:
         worlds: simulator.Worlds, the physics; its box, pusher, force, dynamics (here the drawn ones) and state are here too.
@@ -43,12 +43,16 @@ class PushVectorEnv(gym.vector.VectorEnv):
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
         self.tolerance, self.near_share = 1.0, 0.0
-        self.worlds = Worlds(num_envs, sub_steps, threads=threads)
+        self.worlds = Worlds(num_envs, sub_steps, threads=threads, size=self.world.box, surface=self.world.surface)
         self._steps = np.zeros(num_envs, int)
 
     box, pusher = property(attrgetter("worlds.box")), property(attrgetter("worlds.pusher"))
     force, dynamics = property(attrgetter("worlds.force")), property(attrgetter("worlds.dynamics"))
     state = property(attrgetter("worlds.state"))
+
+    def scaled(self, state):
+        """Observations (..., 8) of states (..., 7)."""
+        return task.scale(state, self.world.max_force)
 
     def _draw_boxes(self, count):
         """Poses (count, 3): the angle uniform, then the centre in the rectangle that the world leaves it."""
@@ -64,7 +68,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
         pushers = rng.uniform(-1, 1, (count, 2)) * task.HALF if pusher is None else pusher
         farthest = np.where(near & (pusher is None), 0.03, np.inf)
         for i in range(count if box is None or pusher is None else 0):
-            while not task.START_GAP <= geometry.nearest(boxes[i], pushers[i])[0] <= farthest[i]:
+            while not task.START_GAP <= geometry.nearest(boxes[i], pushers[i], self.world.box)[0] <= farthest[i]:
                 if pusher is None:
                     pushers[i] = rng.uniform(-1, 1, 2) * task.HALF
                 else:
@@ -74,6 +78,10 @@ class PushVectorEnv(gym.vector.VectorEnv):
     def _start(self, worlds, **given):
         box, pusher = self._draw_start(len(worlds), given.pop("box", None), given.pop("pusher", None))
         drawn = {name: self.np_random.uniform(*limits, len(worlds)) for name, limits in self.world.dynamics.items()}
+        polar = self.world.support_offset, (-np.pi, np.pi)
+        distance, angle = (self.np_random.uniform(*limits, len(worlds)) for limits in polar)
+        drawn |= {"support_x": distance * np.cos(angle), "support_y": distance * np.sin(angle)}
+        drawn["mu_static"] = np.maximum(drawn["mu_static"], (drawn | given)["mu_dynamic"])
         self.worlds.place(worlds, box, pusher, drawn | given)
         self._steps[worlds] = 0
 
@@ -86,7 +94,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
             one, value = shapes[name], np.asarray(value, float)
             if value.shape not in (one, (self.num_envs, *one)):
                 raise ValueError(f"reset option {name!r} has shape {value.shape}, not {(self.num_envs, *one)} or {one}")
-            if not np.isfinite(value).all() or name in DYNAMICS and value.min() < 0 or (
+            if not np.isfinite(value).all() or name in self.world.dynamics and value.min() < 0 or (
                     name in ("mass", "limit_surface_c") and value.min() == 0):
                 raise ValueError(f"reset option {name!r} is {value}: not finite, or out of its physical range")
             given[name] = np.array(np.broadcast_to(value, (self.num_envs, *one)))
@@ -100,7 +108,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
         super().reset(seed=seed)
         self._start(np.arange(self.num_envs), **self._given(options))
         state = self.state
-        return task.scale(state), {"state": state}
+        return self.scaled(state), {"state": state}
 
     def advance(self, action):
         """One control step without autoreset: reward, terminated, truncated, success, each (N,)."""
@@ -117,7 +125,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
     def step(self, action):
         reward, terminated, truncated, success = self.advance(action)
         state = self.state
-        obs = task.scale(state)
+        obs = self.scaled(state)
         infos = {"state": state, "success": success}
         ended = np.flatnonzero(terminated | truncated)
         if ended.size:
@@ -125,7 +133,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
             self._start(ended)
             infos["state"] = self.state
             obs = obs.copy()
-            obs[ended] = task.scale(infos["state"][ended])
+            obs[ended] = self.scaled(infos["state"][ended])
         return obs, reward, terminated, truncated, infos
 
 
@@ -145,8 +153,8 @@ class PushEnv(gym.Env):
         self.action_space = self.vector.single_action_space
 
     def _info(self, success):
-        state = self.vector.state[0]
-        return {"state": state, "success": bool(success), "distance": geometry.nearest(state[:3], state[3:5])[0]}
+        state, size = self.vector.state[0], self.vector.world.box
+        return {"state": state, "success": bool(success), "distance": geometry.nearest(state[:3], state[3:5], size)[0]}
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -155,12 +163,12 @@ class PushEnv(gym.Env):
 
     def step(self, action):
         reward, terminated, truncated, success = self.vector.advance(np.asarray(action)[None])
-        obs = task.scale(self.vector.state)[0]
+        obs = self.vector.scaled(self.vector.state)[0]
         return obs, float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(success[0])
 
     def render(self):
         from common import draw  # only pictures need OpenCV
-        return draw.top_view(self.vector.state[0])
+        return draw.top_view(self.vector.state[0], size=self.vector.world.box)
 
 
 gym.register("Push-v0", entry_point="common.env:PushEnv", vector_entry_point="common.env:PushVectorEnv")

@@ -5,6 +5,7 @@ from PIL import Image
 
 from common import draw, symmetry, task
 from common.files import UserError, write_atomic
+from common.task import World
 from common.wrappers import EpisodeWrapper, state_of
 
 WIDTH, HEIGHT = 960, 600  # pixels: the top view, and 120 rows of text below
@@ -32,13 +33,13 @@ class Recorded(EpisodeWrapper):
         return kept
 
 
-def frame(state, o, belief, step):
+def frame(state, o, belief, step, world=World()):
     """Image (HEIGHT, WIDTH, 3) uint8 RGB of a state (7,), what was seen of it (9,) and what was believed (12,)."""
-    image = np.vstack([draw.top_view(state, WIDTH), np.full((HEIGHT - WIDTH // 2, WIDTH, 3), 255, np.uint8)])
+    image = np.vstack([draw.top_view(state, WIDTH, world.box), np.full((HEIGHT - WIDTH // 2, WIDTH, 3), 255, np.uint8)])
     held, q_hat, occluded = task.unscale_pose(o[:4]), task.unscale_pose(belief[:4]), o[8] > 0
-    force, deviation = o[6:8] * task.MAX_FORCE, 2 * belief[8:10] * task.HALF
-    draw.outline(image, held, HELD)
-    draw.outline(image, q_hat, ESTIMATE)
+    force, deviation = o[6:8] * world.max_force, 2 * belief[8:10] * task.HALF
+    draw.outline(image, held, HELD, world.box)
+    draw.outline(image, q_hat, ESTIMATE, world.box)
     axes = np.maximum(np.round(16 * WIDTH / draw.VIEW * deviation), 32).astype(int).tolist()
     cv2.ellipse(image, draw.pixels(q_hat[:2], WIDTH).tolist(), axes, 0, 0, 360, ESTIMATE, 3, cv2.LINE_AA, 4)
     arrow = draw.pixels([state[3:5], state[3:5] + 0.008 * force], WIDTH) // 16  # 8 mm a newton
@@ -61,9 +62,9 @@ def frame(state, o, belief, step):
     return image
 
 
-def write(episode, mp4, gif):
+def write(episode, mp4, gif, world=World()):
     """Writes an episode of Recorded as an mp4 at 15 frames a second, and as a GIF of half its width and rate."""
-    frames = [frame(*row, step) for step, row in enumerate(zip(*(episode[k] for k in ("state", "o", "belief"))))]
+    frames = [frame(*row, step, world) for step, row in enumerate(zip(*(episode[k] for k in ("state", "o", "belief"))))]
     frames += frames[-1:] * task.RATE  # the end stands for a second
     write_mp4(mp4, frames)
     small = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in frames[::2]]

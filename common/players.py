@@ -1,27 +1,13 @@
 """Players of the fixed list of episodes: a policy with what is in its loop, in one kind of world (sec. 5)."""
-from dataclasses import dataclass, replace
 from functools import cache
 
 import torch
 
-from common import episodes, film, geometry, networks, stacks, weights
+from common import episodes, film, geometry, networks, stacks, trajectories, weights
 from common.stacks import METHODS
 from common.task import World
 
 LIST = 2**40  # first seed of the fixed list: no training draws one as large
-
-
-@dataclass
-class Measurement:
-    """So many episodes of the fixed list, played by one policy in one kind of world."""
-
-    method: str
-    episodes: int
-    seed: int = 0
-    occlusion: float | None = None
-    starts: str | None = None  # other ones than the world's
-    greedy: bool = True
-    switches: bool = False
 
 
 class Players:
@@ -38,17 +24,19 @@ class Players:
         torch.manual_seed(seed)
         method = METHODS[m.method]
         estimator = self.estimator(method.estimator)
-        world = replace(self.world, starts=m.starts or self.world.starts)
-        env = stacks.make(method, self.cfg.num_envs, estimator, self.cfg.passes, m.occlusion, world=world)
-        env = film.Recorded(env)
+        num, world = min(m.episodes, self.cfg.num_envs), m.world or self.world
+        env = film.Recorded(stacks.make(method, num, estimator, self.cfg.passes, m.occlusion, world=world))
         return *episodes.play(env, self.policy(m.method, m.seed), seed, m.greedy), env
 
     def measure(self, m, number):
-        """One number an episode of a chunk: 1 for success, or its contact switches."""
+        """Of each episode of a chunk: 1 for success, its contact switches, or its errors (trajectories.in_the_loop)."""
         success, length, env = self.chunk(m, number)
+        told = success.astype(int).tolist()
         if m.switches:
-            success = [geometry.contact_switches(env.episode(i, n)["state"]) for i, n in enumerate(length)]
-        return [int(x) for x in success[:m.episodes - number * self.cfg.num_envs]]
+            told = [geometry.contact_switches(env.episode(i, n)["state"], self.world.box) for i, n in enumerate(length)]
+        if m.errors:
+            told = trajectories.in_the_loop(env.rows, length).tolist()
+        return told[:m.episodes - number * self.cfg.num_envs]
 
     def episode(self, m, index):
         """Episode `index` of the list: states, observations, beliefs and success."""

@@ -155,7 +155,25 @@ def occlusion_duration(results, path):
     write_atomic(path, figure.savefig)
 
 
-def trajectory_with_uncertainty(episodes, path, cases, count, index):
+def other_worlds(results, path):
+    """Success, with Wilson intervals, in each of the other worlds; results as in results.json."""
+    rows = {"as trained": results["success_rate"]} | results["other_worlds"]
+    methods = next(iter(results["other_worlds"].values()))
+    figure, ax = new(7, 1.2 + 0.3 * len(rows))
+    for i, method in enumerate(methods):
+        name, color, marker = style(method)
+        y, points = zip(*((k, rates[method]) for k, rates in enumerate(rows.values()) if method in rates))
+        mean, low, high = (100 * np.array([p[key] for p in points]) for key in ("mean", "low", "high"))
+        offset = 0.13 * (i - (len(methods) - 1) / 2)  # one below the other, so that no bar hides another
+        ax.errorbar(mean, np.array(y) + offset, xerr=(mean - low, high - mean), color=color, marker=marker, ls="", ms=4,
+                    elinewidth=1, label=name)
+    ax.set_yticks(range(len(rows)), rows)
+    ax.set(xlabel=SUCCESS_AXIS["ylabel"], xlim=SUCCESS_AXIS["ylim"], ylim=(len(rows) - 0.5, -0.5))
+    figure.legend(loc="outside upper center", ncols=3)
+    write_atomic(path, figure.savefig)
+
+
+def trajectory_with_uncertainty(episodes, path, cases, count, index, size=task.World.box):
     """Fig. trajectory_with_uncertainty: the true and the estimated box at six instants, and the estimator's variance below.
 
     {method: film.Recorded.episode}, of number `index` of the list; in `cases` of `count` the first succeeds, the second fails.
@@ -172,13 +190,13 @@ def trajectory_with_uncertainty(episodes, path, cases, count, index):
                  xlabel="x (m)", xlim=(-0.34, 0.34), ylim=(-0.19, 0.19))
         view.grid(False)
         view.add_patch(Rectangle(-task.HALF, *task.WORKSPACE, fill=False, ec="0.6", lw=1))
-        view.add_patch(Polygon(draw.corners(np.zeros(3)), fc="#AACDF0", ec="none", label="target"))
+        view.add_patch(Polygon(draw.corners(np.zeros(3), size), fc="#AACDF0", ec="none", label="target"))
         view.plot(*state[:, 3:5].T, color="#D22828", lw=1, clip_on=False, label="pusher")
         view.add_patch(Circle(state[-1, 3:5], task.RADIUS, color="#D22828", clip_on=False))
         for k, i in enumerate(np.linspace(0, len(state) - 1, 6).astype(int)):
             shade = matplotlib.colormaps["viridis"](0.95 * (1 - k / 5))
             for pose, label, line in ((state[i], "true box", "-"), (q_hat[i], "estimate", (0, (2, 1.5)))):
-                view.add_patch(Polygon(draw.corners(pose), fill=False, ec=shade, lw=1.6, ls=line, clip_on=False,
+                view.add_patch(Polygon(draw.corners(pose, size), fill=False, ec=shade, lw=1.6, ls=line, clip_on=False,
                                        label=label if k == 5 else None))
             chart.plot(t[i], variance[i], "o", color=shade, ms=7, zorder=3)
         chart.plot(t, variance, color=color, label=r"predicted $\sigma_x^2 + \sigma_y^2$")
@@ -194,11 +212,11 @@ def trajectory_with_uncertainty(episodes, path, cases, count, index):
     write_atomic(path, figure.savefig)
 
 
-def sim(path):
+def sim(path, world=task.World()):
     """Fig. sim: the environment at a start of the study."""
-    world = env.PushEnv("rgb_array")
-    world.reset(seed=0)
-    write_atomic(path, lambda temporary: cv2.imwrite(str(temporary), world.render()[..., ::-1]))
+    one = env.PushEnv("rgb_array", world)
+    one.reset(seed=0)
+    write_atomic(path, lambda temporary: cv2.imwrite(str(temporary), one.render()[..., ::-1]))
 
 
 def robot(columns, title, path):

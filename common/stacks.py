@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 
-from common import task
 from common.belief import Believed
 from common.env import PushVectorEnv
 from common.observation import Observed
@@ -63,7 +62,7 @@ def make(method, num_envs, estimator=None, passes=1, occlusion=None, privileged=
     state is read; privileged: append the true state, see Privileged; world: as in PushVectorEnv.
     """
     env = PushVectorEnv(num_envs, world=world)
-    env = frame = Mirrored(env if method.reads == "s" else Observed(env, occlusion))
+    env = frame = Mirrored(env if method.reads == "s" else Observed(env, occlusion, world))
     if method.estimator:
         env = Believed(env, estimator, passes, sigma=method.reads == "s_hat, sigma")
     return Privileged(env, frame) if privileged else env
@@ -81,7 +80,7 @@ class Privileged(EpisodeWrapper):
         declare_observations(self, env.single_observation_space.shape[0] + 8)
 
     def begin(self, worlds, obs, infos):
-        return np.concatenate([obs, mirror(task.scale(infos["state"][worlds]), self.frame.sign[worlds])], 1)
+        return np.concatenate([obs, mirror(self.unwrapped.scaled(infos["state"][worlds]), self.frame.sign[worlds])], 1)
 
     def observe(self, obs, infos):
-        return np.concatenate([obs, mirror(task.scale(state_of(infos)), infos["sign"])], 1)
+        return np.concatenate([obs, mirror(self.unwrapped.scaled(state_of(infos)), infos["sign"])], 1)

@@ -40,14 +40,22 @@ def error_table(sums):
     return errors(sums["all"]) | {name: errors(sums[name]) for name in ("seen", "occluded")}
 
 
+def in_the_loop(values):
+    """Errors and shares within 1 and 2 standard deviations from the episodes' sums of trajectories.in_the_loop."""
+    sums = np.array(values).T
+    one, two = (sums[5:].sum(1) / sums[0].sum()).tolist()  # 0: the estimator tells no deviations
+    return errors(sums[:5]) | {"within_1_sigma": one or None, "within_2_sigma": two or None, "episodes": len(values)}
+
+
 def spread(values):
     return {"mean": float(np.mean(values)), "std": float(np.std(values))}
 
 
 def summarise(done):
     """results.json from {section/key/...: one number an episode, or an error table}, as 05 measures them."""
-    results = {"occlusion_duration": {}}
-    kinds = {"estimator_ablation": dict, "success_rate": list, "contact_switches": lambda v: spread(v) | {"episodes": len(v)}}
+    results = {"occlusion_duration": {}, "other_worlds": {}}
+    kinds = {"estimator_ablation": dict, "success_rate": list, "contact_switches": lambda v: spread(v) | {"episodes": len(v)},
+             "in_the_loop": in_the_loop}
     for name, values in done.items():
         *keys, last = name.split("/")
         rows = results

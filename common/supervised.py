@@ -10,10 +10,10 @@ from common.progress import bar
 
 
 @torch.no_grad()
-def validate(loss, data, limit, sequences, device):
+def validate(loss, data, limit, sequences, device, world):
     """Mean loss over the valid steps of at most `limit` trajectories: the same noise, occlusions and dropout every time."""
     def one(job):
-        batch = trajectories.observe(data, job[1], (0, 0, job[0], 2), device)
+        batch = trajectories.observe(data, job[1], (0, 0, job[0], 2), device, world)
         return loss(*batch, torch.Generator(device).manual_seed(job[0])).item(), batch[2].sum().item()
 
     parts = trajectories.batches(trajectories.subset(data, limit), sequences)
@@ -46,7 +46,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
                  if len(index) >= ranks.COUNT]
 
         def observed(k):  # 1: to train; other numbers elsewhere
-            return trajectories.observe(data, parts[k], (seed, epoch, k, 1, ranks.RANK), device)
+            return trajectories.observe(data, parts[k], (seed, epoch, k, 1, ranks.RANK), device, run.world)
 
         losses, weights = [], []
         for k, batch in enumerate(speed.ahead(observed, range(len(parts)))):
@@ -63,7 +63,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
             weights.append(steps)
             progress.update()
             progress.set_postfix_str(f"loss {losses[-1]:.3f}", refresh=False)
-        validation_loss = validate(loss, held_out, validation, sequences, device)
+        validation_loss = validate(loss, held_out, validation, sequences, device, run.world)
         if not math.isfinite(validation_loss):
             raise UserError(f"{run.dir}: training diverged in epoch {epoch + 1}: use a lower rate, and --force")
         run.log(epoch=epoch + 1, train_loss=float(np.average(losses, weights=weights)), validation_loss=validation_loss)

@@ -57,6 +57,20 @@ def estimator_ablation(results):
     return f"{title}\n\n{aligned(header, rows)}"
 
 
+def in_the_loop(results):
+    """Errors of the estimates while each policy plays, and how often the truth lies within 1 and 2 standard deviations."""
+    rows = []
+    for method, e in results.get("in_the_loop", {}).items():
+        shares = e["within_1_sigma"], e["within_2_sigma"]
+        rows.append([method, *(within(e[key], e["half_95"][key]) for key in (ERRORS[0], ERRORS[2])),
+                     *("" if share is None else f"{share:.1%}" for share in shares)])
+    if not rows:
+        return ""
+    title = "Errors of the estimate in the loop, with 95 % intervals, and the share of x, y, sin and cos within their sigma"
+    header = ["policy", "mean L2 (mm)", "mean abs. (deg)", "1 sigma (normal: 68.3%)", "2 sigma (95.4%)"]
+    return f"{title}\n\n{aligned(header, rows)}"
+
+
 def success_rate(results):
     """Success under occlusion with 95 % intervals, paired differences and, where there are several, the seeds."""
     rows = []
@@ -81,12 +95,33 @@ def occlusion_duration(results):
     return title + "\n\n" + aligned(header, rows)
 
 
+def other_worlds(results):
+    """Success where one thing is other than in training; the first row is the fixed list of sec. 5.2."""
+    worlds = results.get("other_worlds")
+    if not worlds:
+        return ""
+    methods = list(next(iter(worlds.values())))
+    rows = [[row, *(percent(rates[m]) if m in rates else "" for m in methods)]
+            for row, rates in ({"as trained": results["success_rate"]} | worlds).items()]
+    episodes = next(iter(worlds.values()))[methods[0]]["episodes"]
+    title = f"Success in other worlds, one thing changed at a time, {episodes:,} episodes each"
+    return f"{title}\n\n{aligned(['world', *methods], rows)}"
+
+
 def further(results):
     """Other starts, and sampled actions."""
     sections = {f"starts {name}": rates for name, rates in results.get("starts", {}).items()}
     sections["actions sampled"] = results.get("sampled_actions", {})
     return "\n".join(f"- {method}, {what}: success {percent(rate)}" for what, rates in sections.items()
                      for method, rate in rates.items())
+
+
+SECTIONS = (beside_paper, estimator_ablation, success_rate, in_the_loop, occlusion_duration, other_worlds, further)
+
+
+def every(results):
+    """tables.md: what there is of every section."""
+    return "\n\n".join(filter(None, (section(results) for section in SECTIONS))) + "\n"
 
 
 def robot(summary):

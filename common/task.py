@@ -11,7 +11,6 @@ import numpy as np
 # Geometry (appendix A), m
 WORKSPACE = np.array([0.6, 0.3])
 HALF = WORKSPACE / 2
-BOX = np.array([0.12, 0.10, 0.07])
 RADIUS = 0.013  # the spherical pusher
 
 # Time and actions (sec. 4): 11 bins a velocity, bin k is (k - 5) * 0.01 m/s
@@ -26,25 +25,17 @@ TOLERANCE = np.array([0.01, np.deg2rad(15)])  # m, rad
 R_SUCCESS, R_OUT = 50.0, -10.0
 K_TRANS, K_ROT, K_SPEED = 0.1, 0.02, 0.004
 
-# Dynamics randomisation (appendix A, tab. dynamics_randomization): uniform in [low, high]
-MASS = (3.0, 3.5)  # kg
-MU_STATIC = (0.3, 0.5)
-MU_DYNAMIC = (0.1, 0.3)  # box on table; the pusher on the box is drawn from the same row
-RESTITUTION = (0.1, 0.7)
+# Dynamics and starts
 GRAVITY = 9.81  # m/s^2
-
-# Sensing (tab. occlusion_and_noise_params); the per-episode bias and the per-step noise share one standard deviation
-NOISE = np.array([0.0025, 0.0025, 0.05, 0.7, 0.7])  # box x, y (m), theta (rad), force x, y (N)
-OCCLUSION_START = 1 / 30  # probability at each visible step
-OCCLUSION_MEAN, OCCLUSION_STD = 10.0, 5.0  # s
-MAX_FORCE = 10.0  # N, clip of each axis (appendix B)
-
-# Starts
-START_BOX = np.array([0.20, 0.059])  # m, half widths of the inner starts of a box's centre: the pusher gets behind it at once
+INNER = np.array([0.20, 0.059])  # m, half widths of the inner starts of a box's centre
 START_GAP = 0.001  # m, least distance between pusher and box
 STARTS = ("box", "centre", "inner")
 
+# Worlds
+NOISE = (0.0025, 0.0025, 0.05, 0.7, 0.7)  # standard deviation, in m, rad, N (tab. occlusion_and_noise_params)
 C_060 = (0.4959084413236055,) * 2  # support of c = 0.060 m, the only one until c was drawn for each episode
+DRAWN = ("mass", "mu_static", "mu_dynamic", "mu_pusher", "restitution")  # for an episode, from ranges, in this order
+Range = tuple[float, float]
 
 
 def mean_distance(sides):
@@ -60,10 +51,38 @@ def since(default, before):
 
 @dataclass(frozen=True)
 class World:
-    """What is drawn for an episode, and from where. The defaults are the study's."""
+    """What is drawn for an episode, and from where; ranges are uniform. The defaults are the study's.
 
-    starts: Literal[STARTS] = since("box", "inner")  # what lies within the workspace: the box, its centre; inner: far from borders
-    support: tuple[float, float] = since((0.0, 1.0), C_060)  # least and greatest c, from even pressure (0) to four corners (1)
+    Raises ValueError: no such world.
+    """
+
+    starts: Literal[STARTS] = since("box", "inner")  # within the workspace: the box, its centre; inner: far from the borders
+    box: tuple[float, float, float] = (0.12, 0.10, 0.07)  # length, width, height in m (appendix A)
+    mass: Range = (3.0, 3.5)  # of the box, kg (tab. dynamics_randomization)
+    mu_static: Range = (0.3, 0.5)  # box on table, at least its mu_dynamic (tab. dynamics_randomization)
+    mu_dynamic: Range = (0.1, 0.3)  # box on table (tab. dynamics_randomization)
+    mu_pusher: Range = (0.1, 0.3)  # pusher on box; the paper's table has one row for all dynamic friction
+    restitution: Range = (0.1, 0.7)  # pusher on box (tab. dynamics_randomization)
+    support: Range = since((0.0, 1.0), C_060)  # friction's c, from even pressure under the box (0) to all on its corners (1)
+    support_offset: Range = (0.0, 0.0)  # distance of friction's centre from the box's in m, in a random direction
+    pusher_height: float = 0.035  # of its centre above the table, m
+    noise: tuple[float, float, float, float, float] = NOISE  # of a step: box x, y (m), theta (rad), force x, y (N)
+    bias: tuple[float, float, float, float, float] = NOISE  # of an episode, likewise (tab. occlusion_and_noise_params)
+    occlusion_start: float = 1 / 30  # probability at each visible step (tab. occlusion_and_noise_params)
+    occlusion: Range = (10.0, 5.0)  # mean and standard deviation of its duration in s (tab. occlusion_and_noise_params)
+    max_force: float = 10.0  # clip of each axis, N (appendix B)
+    late, gain, surface = 0, 1.0, 2.0  # see Other
+
+    def __post_init__(self):
+        diagonal = float(np.hypot(*self.box[:2]))
+        if min(self.box) <= 0 or diagonal >= min(WORKSPACE):
+            raise ValueError(f"--box {self.box}: of its diagonal, {diagonal:.2f} m, the workspace leaves no room to start")
+        for name in (*DRAWN, "support", "support_offset"):
+            low, high = getattr(self, name)
+            if not 0 <= low <= high < np.inf or name == "mass" and not low:
+                raise ValueError(f"--{name.replace('_', '-')} {low} {high}: a range, the least first")
+        if not self.max_force > 0:
+            raise ValueError(f"--max-force {self.max_force}: above 0")
 
     @classmethod
     def of(cls, settings):
@@ -72,22 +91,29 @@ class World:
         return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in past.items()})
 
     @property
-    def limit_surface_c(self):
-        """Range (2,) of friction torque / friction force, m."""
-        even, corners = mean_distance(BOX[:2]), np.linalg.norm(BOX[:2] / 2)
-        return tuple(even + share * (corners - even) for share in self.support)
-
-    @property
     def dynamics(self):
-        """Ranges (2,) of what is drawn for an episode, uniformly, in this order: {name: (low, high)}, names and units of Worlds."""
-        return {"mass": MASS, "mu_static": MU_STATIC, "mu_dynamic": MU_DYNAMIC, "mu_pusher": MU_DYNAMIC,
-                "restitution": RESTITUTION, "limit_surface_c": self.limit_surface_c}
+        """Ranges of what is drawn for an episode, in this order: names and units as in simulator.Worlds."""
+        even, corners = mean_distance(self.box[:2]), np.linalg.norm(self.box[:2]) / 2
+        return {name: getattr(self, name) for name in DRAWN} | {
+            "limit_surface_c": tuple(even + share * (corners - even) for share in self.support)}
 
     def centre_range(self, angle):
         """Half widths (N, 2) in m of the rectangle about the target in which the centres of boxes at angles (N,) start."""
         cos, sin = np.abs(np.cos(angle)), np.abs(np.sin(angle))
-        corners = np.stack([cos, sin, sin, cos], -1).reshape(-1, 2, 2) @ BOX[:2] / 2  # the farthest, along x and y
-        return {"box": HALF - corners, "centre": HALF, "inner": START_BOX}[self.starts] + 0 * corners
+        corners = np.stack([cos, sin, sin, cos], -1).reshape(-1, 2, 2) @ self.box[:2] / 2  # the farthest, along x and y
+        return {"box": HALF - corners, "centre": HALF, "inner": INNER}[self.starts] + 0 * corners
+
+
+@dataclass(frozen=True)
+class Other(World):
+    """A world with what no training knows, to evaluate in."""
+
+    late: int = 0  # steps by which the camera's frames are
+    gain: float = 1.0  # of the force sensor
+    surface: float = 2.0  # exponent of the limit surface; 2 is an ellipsoid
+
+
+BOX = np.array(World.box)  # the one that the robot's tags, arm and pictures are made for
 
 
 def wrap(angle):
@@ -95,10 +121,10 @@ def wrap(angle):
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def scale(state):
+def scale(state, max_force=World.max_force):
     """States (..., 7) to network inputs (..., 8): x, y, sin, cos, pusher x, y, force x, y, each in [-1, 1] (appendix B)."""
-    theta, force = state[..., 2:3], np.clip(state[..., 5:7], -MAX_FORCE, MAX_FORCE)
-    parts = state[..., :2] / HALF, np.sin(theta), np.cos(theta), state[..., 3:5] / HALF, force / MAX_FORCE
+    theta, force = state[..., 2:3], np.clip(state[..., 5:7], -max_force, max_force)
+    parts = state[..., :2] / HALF, np.sin(theta), np.cos(theta), state[..., 3:5] / HALF, force / max_force
     return np.concatenate(parts, -1, dtype=np.float32)
 
 

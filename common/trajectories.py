@@ -60,12 +60,12 @@ def subset(data, limit):
     return np.linspace(0, total - 1, min(limit, total)).astype(int)
 
 
-def observe(data, index, seed, device):
+def observe(data, index, seed, device, world=task.World()):
     """Batch of freshly drawn o (T, B, 9) and scaled true states (T, B, 8), mirrored by o[0] as in a stack, and mask (T, B)."""
     states, mask = padded(data, index)
-    o = observation.ObservationModel(len(index), seed).trajectory(states)
+    o = observation.ObservationModel(len(index), seed, world=world).trajectory(states)
     sign = symmetry.signs(o[0])
-    o, s = symmetry.mirror(o, sign), symmetry.mirror(task.scale(states), sign)
+    o, s = symmetry.mirror(o, sign), symmetry.mirror(task.scale(states, world.max_force), sign)
     return tuple(torch.as_tensor(x, device=device) for x in (o, s, mask))
 
 
@@ -83,15 +83,30 @@ def pose_errors(q_hat, q, occluded, mask):
     return {name: (terms * chosen).sum(1) for name, chosen in steps.items()}
 
 
+def in_the_loop(rows, length):
+    """Errors of the beliefs while a policy played: film.Recorded's rows, lengths (N,) of the episodes.
+
+    (N, 7) sums over an episode's steps: those of pose_errors, and how many of x, y, sin and cos, as shares of the four, lie
+    within 1 and 2 of their standard deviations.
+    """
+    state, o, belief = (np.stack([row[name] for row in rows[:length.max()]]) for name in ("state", "o", "belief"))
+    q = symmetry.mirror(task.scale(state), symmetry.signs(o[0]))[..., :4]
+    mask = (np.arange(len(q))[:, None] < length).astype(np.float32)
+    sums = pose_errors(*map(torch.as_tensor, (belief[..., :4], q, o[..., 8], mask)))["all"]
+    off = np.abs(belief[..., :4] - q)
+    within = [((off <= k * belief[..., 8:]).mean(-1) * mask).sum(0) for k in (1, 2)]
+    return np.concatenate([sums, within]).T
+
+
 @torch.no_grad()
-def measure(data, limit, size, seed, device, predict):
+def measure(data, limit, size, seed, device, predict, world=task.World()):
     """`pose_errors` of predict(o) (T, B, 4) over at most `limit` trajectories, with the same noise for every predict.
 
     Each process measures some, and rank 0 has them all, the others none. Seeds torch for each batch.
     """
     def one(job):
         k, index = job
-        o, s, mask = observe(data, index, (seed, 0, k, 3), device)
+        o, s, mask = observe(data, index, (seed, 0, k, 3), device, world)
         torch.manual_seed(int(np.random.SeedSequence([seed, k]).generate_state(1)[0]))
         with speed.autocast(device):
             q_hat = predict(o)

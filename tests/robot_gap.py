@@ -39,7 +39,7 @@ def main(cfg):
         starts.append({"box": arm.box.copy(), "pusher": arm.points[7, :2]} | dynamics)
     starts = {key: np.array([start[key] for start in starts]) for key in starts[0]}
     share = statistics.robot_runs({"natural": logs})["natural"]["occluded_share"]
-    seconds = share / (1 - share) / task.OCCLUSION_START / task.RATE
+    seconds = share / (1 - share) / world.occlusion_start / task.RATE
     estimator, policy = (weights.load(kind, path) for kind, path in zip((networks.Estimator, networks.Recurrent), paths))
     won, hidden, steps = [], 0, 0
     for seed in bar(REPEATS, "05's world", unit="repeat"):

@@ -10,10 +10,11 @@ from gymnasium.vector import AutoresetMode
 from common import draw, geometry, task
 from common.env import PushEnv, PushVectorEnv
 from common.simulator import SUB_STEPS
+from common.task import Other, World
 
 C = [0.042, 0.060, 0.078]  # m: even pressure, between, four corners
 G = task.GRAVITY
-HALF_BOX = task.BOX[:2] / 2
+HALF_BOX = np.array(World.box[:2]) / 2
 GYRATION = (0.12**2 + 0.10**2) / 12  # m^2, moment of inertia / mass
 REST = 5  # the bin of zero velocity
 MIDDLE = {"mass": 3.25, "mu_static": 0.4, "mu_dynamic": 0.2, "mu_pusher": 0.2, "restitution": 0.4, "limit_surface_c": 0.060}
@@ -151,6 +152,59 @@ def quasi_static(offset, mu_pusher, speed, c, seconds, dt=5e-4):
         box += dt * np.stack([cos * normal - sin * tangential, sin * normal + cos * tangential, omega], 1)
         pusher[:, 0] += speed * dt
     return box
+
+
+def test_a_push_through_the_centre_of_friction_turns_nothing():
+    offset, tilt = np.array([[0.0, 0.02], [0.02, -0.03], [0.01, 0.0], [-0.03, 0.04]]), np.array([0, np.pi / 2, np.pi, -np.pi / 2])
+    along = np.array([geometry.rotation(angle) @ d for angle, d in zip(tilt, offset)])  # in the world's frame
+    half = np.where(np.arange(4) % 2 == 0, *HALF_BOX)
+    pusher = np.stack([-half - task.RADIUS, along[:, 1]], 1)
+    poses = np.pad(tilt[:, None], ((0, 0), (2, 0)))
+    env = start(4, box=poses, pusher=pusher, mu_pusher=0, support_x=offset[:, 0], support_y=offset[:, 1])
+    play(env, [10, REST], 30)
+    assert env.box[:, 0] == pytest.approx(0.1, abs=0.004) and np.abs(env.box - poses)[:, 1:].max() < 1e-3
+    centred = start(4, box=poses, pusher=pusher, mu_pusher=0)
+    play(centred, [10, REST], 30)
+    assert (np.abs(centred.box - poses)[[0, 1, 3], 2] > 0.2).all()
+
+
+def test_a_box_spins_about_its_centre_of_friction():
+    env = start(box=[0.1, 0, 0.3], mu_dynamic=0.15, support_x=0.02, support_y=-0.01)
+    launch(env, (0, 0), 8.0)
+    play(env, REST, 30)
+    moved = env.box[0, :2] + geometry.rotation(env.box[0, 2]) @ [0.02, -0.01]
+    assert moved == pytest.approx([0.1, 0] + geometry.rotation(0.3) @ [0.02, -0.01], abs=1e-9) and env.box[0, 2] > 0.6
+    env.reset(options=MIDDLE | {"box": [0.1, 0, 0.3], "pusher": [-0.1, 0], "support_x": 0.0, "support_y": 0.0, "mu_dynamic": 0.15})
+    launch(env, (0, 0), 8.0)
+    play(env, REST, 30)
+    assert env.box[0, :2] == pytest.approx([0.1, 0], abs=1e-9)  # nothing of it stays
+
+
+@pytest.mark.parametrize("k", [1.5, 2.0, 4.0])
+def test_a_frictionless_push_turns_the_box_along_the_normal_of_its_limit_surface(k):
+    offset = np.array([0.005, 0.02, -0.045])
+    env = PushVectorEnv(3, world=Other(surface=k))
+    env.reset(options=MIDDLE | {"box": [0, 0, 0], "pusher": west(offset), "mu_pusher": 0.0, "restitution": 0.0})
+    states = play(env, [8, REST], 8)
+    turn, way = states[-1, :, 2] - states[3, :, 2], np.linalg.norm(states[-1, :, :2] - states[3, :, :2], axis=1)
+    middle = (states[-1, :, 2] + states[3, :, 2]) / 2  # the lever of the force changes as the box turns
+    lever = (np.cos(middle) * (states[[3, -1], :, 4] - states[[3, -1], :, 1]).mean(0)
+             - np.sin(middle) * (states[[3, -1], :, 3] - states[[3, -1], :, 0]).mean(0))
+    expected = -np.sign(offset) * (np.abs(lever) / 0.060)**(k - 1) / 0.060  # of turn by way
+    assert turn / way == pytest.approx(expected, rel=0.08, abs=0.01)
+
+
+@pytest.mark.parametrize("k", [1.5, 4.0])
+def test_a_free_slide_and_spin_on_another_limit_surface(k):
+    mu, c, p, v, w, x, theta, dt = 0.2, 0.060, k / (k - 1), 0.3, 3.0, 0.0, 0.0, 1e-5
+    while (n := (v**p + (c * w)**p)**(1 / p)) > 2 * mu * G * dt:
+        x, theta = x + v * dt, theta + w * dt
+        v, w = max(v - mu * G * (v / n)**(p - 1) * dt, 0), max(w - mu * G * c / GYRATION * (c * w / n)**(p - 1) * dt, 0)
+    env = PushVectorEnv(1, world=Other(surface=k))
+    env.reset(options=MIDDLE | {"box": [0, 0, 0], "pusher": [-1, -1], "mu_dynamic": mu})
+    launch(env, (0.3, 0), 3.0)
+    play(env, REST, 30)
+    assert env.box[0, [0, 2]] == pytest.approx([x, theta], rel=0.06)
 
 
 @pytest.mark.parametrize("seconds", [1, 2])
@@ -298,6 +352,53 @@ def test_a_box_starts_whole_within_the_workspace():
         assert outside.any() == (starts == "centre")
 
 
+OTHER = World(box=(0.14, 0.08, 0.05), mass=(1.0, 2.0), mu_static=(0.2, 0.5), mu_dynamic=(0.3, 0.6), support=(0.5, 0.5))
+
+
+def test_a_world_of_ones_own():
+    env = PushVectorEnv(1000, world=OTHER)
+    env.reset(seed=8)
+    corners = np.abs([draw.corners(box, OTHER.box) for box in env.box])
+    assert (corners <= task.HALF + 1e-9).all() and (corners.max((0, 1)) > task.HALF - 0.004).all()
+    distance = [geometry.nearest(box, pusher, OTHER.box)[0] for box, pusher in zip(env.box, env.pusher)]
+    assert 0.001 <= min(distance) < 0.004
+    mass, c = env.dynamics["mass"], env.dynamics["limit_surface_c"]
+    assert 1.0 <= mass.min() < 1.02 and 1.98 < mass.max() <= 2.0
+    x, y = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 10**6)) * [[0.14], [0.08]]
+    assert c == pytest.approx(np.full(1000, (np.hypot(x, y).mean() + np.hypot(0.07, 0.04)) / 2), abs=1e-4)
+    assert (env.dynamics["mu_static"] >= env.dynamics["mu_dynamic"]).all() and env.dynamics["mu_dynamic"].max() > 0.59
+
+
+def test_a_box_of_another_size_stops_and_is_pushed_as_its_size_says():
+    env = PushVectorEnv(1, world=OTHER)
+    options = MIDDLE | {"box": [0, 0, 0], "mu_dynamic": 0.15, "limit_surface_c": 0.06}
+    env.reset(seed=0, options=options | {"pusher": [-0.2, -0.1]})
+    launch(env, (0, 0), 5.0)
+    play(env, REST, 30)
+    assert env.box[0, 2] == pytest.approx(25 / (2 * 0.15 * G * 0.06 / ((0.14**2 + 0.08**2) / 12)), rel=0.03)
+    env.reset(options=options | {"pusher": [-0.1, 0]})
+    states = play(env, [10, REST], 15)
+    touched = (states[:, 0, 5] != 0).argmax()
+    gap = states[touched:, 0, 0] - states[touched:, 0, 3]
+    assert gap == pytest.approx(np.full(len(gap), 0.07 + task.RADIUS), abs=2e-4)
+
+
+def test_observations_clip_at_the_worlds_force():
+    env = PushVectorEnv(1, world=World(max_force=2.0))
+    env.reset(options=MIDDLE | {"box": [0.1, 0, 0], "pusher": [0.0269, 0]})
+    obs = [env.step([[8, REST]])[0] for _ in range(10)]
+    assert obs[-1][0, 6] == -1.0 and env.force[0, 0] < -2
+
+
+@pytest.mark.parametrize("changes, words", [
+    ({"box": (0.25, 0.2, 0.07)}, "0.32 m, the workspace leaves no room to start"), ({"box": (0.1, 0.0, 0.07)}, "no room"),
+    ({"mass": (2.0, 1.0)}, "--mass 2.0 1.0"), ({"mass": (0.0, 1.0)}, "--mass"), ({"support": (0.5, 0.2)}, "--support"),
+    ({"mu_dynamic": (-0.1, 0.2)}, "--mu-dynamic"), ({"support_offset": (0.1, 0.0)}, "--support-offset")])
+def test_no_such_world(changes, words):
+    with pytest.raises(ValueError, match=words):
+        World(**changes)
+
+
 def test_near_starts_are_an_aid():
     env = PushVectorEnv(400)
     env.near_share = 0.5
@@ -317,7 +418,7 @@ def test_dynamics_are_drawn_anew_from_the_table(name):
     assert first.mean() == pytest.approx((low + high) / 2, abs=0.03 * (high - low))
     env.reset()
     assert not (env.dynamics[name] == first).any()
-    assert np.abs(np.corrcoef(list(env.dynamics.values())) - np.eye(len(RANGES))).max() < 0.1
+    assert np.abs(np.corrcoef([env.dynamics[other] for other in RANGES]) - np.eye(len(RANGES))).max() < 0.1
 
 
 def test_reset_takes_any_subset_of_the_options():
@@ -341,7 +442,8 @@ def test_what_is_not_given_keeps_clear_of_what_is(given):
 
 @pytest.mark.parametrize("options", [
     {"masss": 3.0}, {"box": [0, 0]}, {"box": 0.1}, {"box": np.zeros((2, 3))}, {"pusher": np.zeros((3, 1))}, {"mass": [3, 3]},
-    {"mass": np.full((3, 1), 3)}, {"mass": 0}, {"limit_surface_c": 0}, {"mu_pusher": -0.1}, {"restitution": np.nan}, {"box": [np.inf, 0, 0]},
+    {"mass": np.full((3, 1), 3)}, {"mass": 0}, {"limit_surface_c": 0}, {"mu_pusher": -0.1}, {"restitution": np.nan},
+    {"box": [np.inf, 0, 0]},
     {"mass": "heavy"},
 ])
 def test_wrong_options_are_refused(options):

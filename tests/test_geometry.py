@@ -3,7 +3,7 @@ import pytest
 
 from common import geometry, task
 
-HALF_BOX = task.BOX[:2] / 2
+HALF_BOX = np.array(task.World.box[:2]) / 2
 
 
 def in_box_frame(box, pusher):

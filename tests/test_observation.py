@@ -6,6 +6,7 @@ import pytest
 from common import task
 from common.env import PushVectorEnv
 from common.observation import ObservationModel, Observed
+from common.task import Other, World
 
 VISION = np.s_[..., :4]  # the box in an observation
 
@@ -20,7 +21,7 @@ def moving(steps, num):
 def errors(o, states):
     """o - s of box x, y, angle and force (..., 5), in SI units; unoccluded, unclipped."""
     pose = task.unscale_pose(o[VISION])
-    force = o[..., 6:8] * task.MAX_FORCE
+    force = o[..., 6:8] * World.max_force
     return np.concatenate([pose[..., :2] - states[..., :2], task.wrap(pose[..., 2:] - states[..., 2:3]),
                            force - states[..., 5:]], -1)
 
@@ -36,9 +37,9 @@ def test_bias_is_drawn_per_episode_and_noise_per_step_as_in_the_table():
     states = moving(steps, num)
     e = errors(ObservationModel(num, 0, 0).trajectory(states), states)
     bias, noise = e.mean(0), e - e.mean(0)
-    np.testing.assert_allclose(noise.std((0, 1)) * np.sqrt(steps / (steps - 1)), task.NOISE, rtol=0.02)
-    np.testing.assert_allclose(bias.std(0), task.NOISE * np.sqrt(1 + 1 / steps), rtol=0.05)
-    assert (np.abs(bias.mean(0)) < 4 * task.NOISE / np.sqrt(num)).all()
+    np.testing.assert_allclose(noise.std((0, 1)) * np.sqrt(steps / (steps - 1)), World.noise, rtol=0.02)
+    np.testing.assert_allclose(bias.std(0), np.array(World.bias) * np.sqrt(1 + 1 / steps), rtol=0.05)
+    assert (np.abs(bias.mean(0)) < World.bias * np.array(4) / np.sqrt(num)).all()
     assert np.abs(np.corrcoef(bias.T) - np.eye(5)).max() < 0.07
     assert np.abs(np.corrcoef(noise[0].T) - np.eye(5)).max() < 0.07
     assert np.abs(np.corrcoef(noise[3, :, 0], noise[4, :, 0])[0, 1]) < 0.1  # one step says nothing of the next
@@ -92,15 +93,52 @@ def test_durations_are_those_of_the_table():
 
 
 @pytest.mark.parametrize("seconds, frames", [(0.5, 8), (2.5, 38), (5, 75), (0.02, 0), (0, 0), (-3, 0)])
-def test_a_fixed_duration_with_one_seen_frame_between(seconds, frames, monkeypatch):
-    monkeypatch.setattr(task, "OCCLUSION_START", 1.0)  # at every chance
-    xi = ObservationModel(3, 0, seconds).trajectory(np.zeros((200, 3, 7), np.float32))[..., 8]
+def test_a_fixed_duration_with_one_seen_frame_between(seconds, frames):
+    at_every_chance = World(occlusion_start=1.0)
+    xi = ObservationModel(3, 0, seconds, at_every_chance).trajectory(np.zeros((200, 3, 7), np.float32))[..., 8]
     assert (xi[:, 0] == (np.arange(200) % (frames + 1) > 0)).all() and (xi == xi[:, :1]).all()
 
 
-def test_negative_durations_of_the_table_hide_nothing(monkeypatch):
-    monkeypatch.setattr(task, "OCCLUSION_MEAN", -50.0)
-    assert not ObservationModel(100, 0).trajectory(np.zeros((100, 100, 7), np.float32))[..., 8].any()
+def test_negative_durations_of_the_table_hide_nothing():
+    model = ObservationModel(100, world=World(occlusion=(-50.0, 5.0)))
+    assert not model.trajectory(np.zeros((100, 100, 7), np.float32))[..., 8].any()
+
+
+def test_noise_bias_and_force_are_the_worlds():
+    steps, num = 30, 4000
+    world = World(noise=(0.001, 0.002, 0.03, 0.4, 0.5), bias=(0.006, 0.007, 0.08, 0.9, 1.0), max_force=50.0)
+    states = moving(steps, num)
+    o = ObservationModel(num, 0, 0, world).trajectory(states)
+    o[..., 6:8] *= world.max_force / World.max_force
+    e = errors(o, states)
+    bias, noise = e.mean(0), e - e.mean(0)
+    np.testing.assert_allclose(noise.std((0, 1)) * np.sqrt(steps / (steps - 1)), world.noise, rtol=0.02)
+    np.testing.assert_allclose(bias.std(0), np.hypot(world.bias, np.array(world.noise) / np.sqrt(steps)), rtol=0.05)
+
+
+@pytest.mark.parametrize("late", [1, 2])
+def test_a_late_camera_shows_the_box_of_before_and_the_force_of_now(late):
+    states = moving(40, 30)
+    now, then = (ObservationModel(30, 0, world=Other(late=k)).trajectory(states) for k in (0, late))
+    behind = states.copy()
+    behind[..., :3] = states[np.maximum(np.arange(40) - late, 0), :, :3]
+    np.testing.assert_array_equal(then, ObservationModel(30, 0).trajectory(behind))
+    np.testing.assert_array_equal(then[..., 4:], now[..., 4:])
+
+
+def test_a_late_camera_forgets_the_episode_before():
+    model, states = ObservationModel(4, 0, 0, Other(late=2)), moving(6, 4)
+    model.trajectory(states)
+    model.reset(np.array([1]), states[:1, 1] + 0.01)
+    off = errors(model.step(states[1] + 0.01), states[0] + 0.01)
+    assert np.abs(off[1, :2]).max() < 0.02 < np.abs(off[[0, 2, 3], :2]).max()
+
+
+def test_the_force_has_a_gain():
+    states = moving(20, 50)
+    one, other = (ObservationModel(50, 0, world=Other(gain=gain, max_force=99.0)).trajectory(states) for gain in (1.0, 0.7))
+    np.testing.assert_array_equal(one[..., :6], other[..., :6])
+    np.testing.assert_allclose((one - other)[..., 6:8] * 99, 0.3 * states[..., 5:], atol=1e-4)
 
 
 def test_until_the_end():
@@ -177,7 +215,7 @@ def test_final_obs_is_of_the_ended_episode_and_the_next_observation_of_the_new_o
                 assert (final[VISION] == held[world]).all() and final[8] == 1
             assert (final[4:6] == task.scale(state.astype(np.float32))[4:6]).all()
             assert o[world, 8] == 0
-            assert (np.abs(errors(o[world], infos["state"][world])) < 7 * task.NOISE).all()
+            assert (np.abs(errors(o[world], infos["state"][world])) < World.noise * np.array(7)).all()
             checked.add(world)
     assert len(checked & set(range(12))) > 5 and len(checked - set(range(12))) > 5
 

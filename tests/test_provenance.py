@@ -105,10 +105,10 @@ class Worldly(command.Stage):
 
 
 def test_a_run_has_the_world_of_its_inputs(config, tmp_path):
-    world = World(starts="centre", support=(0.2, 0.4))
+    world = World(starts="centre", support=(0.2, 0.4), box=(0.14, 0.10, 0.07), mass=(1.0, 2.0))
     first = make(Worldly(preset="quick", out=tmp_path / "runs", world=world), "01_a", 1)
-    assert json.loads((first.parent / "config.json").read_text())["settings"] == {
-        "seed": 0, "starts": "centre", "support": [0.2, 0.4]}
+    settings = json.loads((first.parent / "config.json").read_text())["settings"]
+    assert settings.keys() == {"seed", *vars(world)} and (settings["starts"], settings["support"]) == ("centre", [0.2, 0.4])
     second = make(config(), "02_b", 2, {"a": first})
     assert runs.Run(config(), "03_c", {"b": second}).world == world
     assert runs.Run(Worldly(preset="quick", out=tmp_path), "01_a").world == World()
@@ -126,7 +126,7 @@ def test_a_run_of_before_the_world_is_known_by_its_world(config, tmp_path):
     path = make(cfg, "01_a", 1)
     record(path, starts=None, support=None)
     old = runs.Run(config(), "02_b", {"a": path}).world
-    assert old == World("inner", C_060) and old.limit_surface_c == (0.060, 0.060)
+    assert old == World("inner", support=C_060) and old.dynamics["limit_surface_c"] == (0.060, 0.060)
     with pytest.raises(UserError, match="starts inner -> box, support "):
         runs.Run(cfg, "01_a")
 
@@ -134,7 +134,7 @@ def test_a_run_of_before_the_world_is_known_by_its_world(config, tmp_path):
 @pytest.mark.parametrize("folder", PUBLISHED, ids=str)
 def test_published_nets_are_of_the_world_of_before(folder):
     record = json.loads((ROOT / "pretrained" / folder / "config.json").read_text())
-    assert World.of(record["settings"] | record.get("world", {})) == World("inner", C_060)
+    assert World.of(record["settings"] | record.get("world", {})) == World("inner", support=C_060)
 
 
 # Weights from elsewhere

@@ -393,7 +393,8 @@ def test_the_program_thinks_as_the_training_stack_does(corner, float32):
     memory = recall = None
     for _ in range(20):
         o = infos["o"][0]
-        row = {"seen": task.unscale_pose(o[:4]), "age": o[8], "pusher": o[4:6] * task.HALF, "force": o[6:8] * task.MAX_FORCE}
+        row = {"seen": task.unscale_pose(o[:4]), "age": o[8], "pusher": o[4:6] * task.HALF,
+               "force": o[6:8] * task.World.max_force}
         s_hat, action, memory = think(f, pi, 1, row, memory)
         assert np.allclose(s_hat, symmetry.mirror(infos["belief"], env.env.sign)[0], atol=1e-4)
         with torch.no_grad():

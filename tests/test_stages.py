@@ -15,7 +15,7 @@ import pytest
 import torch
 from conftest import SCRIPTS, run, start
 
-from common import command, files, networks, ppo, runs, stacks, statistics, task, trajectories, weights
+from common import command, files, measurements, networks, ppo, runs, stacks, statistics, task, trajectories, weights
 from common.env import PushVectorEnv
 from common.task import World
 
@@ -34,7 +34,7 @@ OUTPUTS = {
     "04_train_policy/behavior_cloning/seed0": ["policy.safetensors", "bc_loss.png"],
     "05_evaluate/seed0": ["results.json", "measurements.json", "tables.md", "success_rate.png", "occlusion_duration.png",
                           "sim.png", "trajectory_with_uncertainty.png", "film.mp4", "film.gif", "success_rate_priv.png",
-                          "likelihood_loss.png", "mse_loss.png", "bc_loss.png"],
+                          "likelihood_loss.png", "mse_loss.png", "bc_loss.png", "other_worlds.png"],
     "06_robot/seed0": ["summary.json", "robot.png", "natural_000.npz", "hand_5s_000.npz", "hand_full_000.npz"],
 } | {f"04_train_policy/{m}/seed0": ["policy.safetensors", "training.png", "success_rate.png"]
      for m in POLICIES - {"behavior_cloning"}}
@@ -202,6 +202,16 @@ def test_results_have_every_number(study):
     for rate in rates + [rate for row in results["occlusion_duration"].values() for rate in row.values()]:
         assert 0 <= rate["low"] <= rate["mean"] <= rate["high"] <= 1 and rate["high"] > rate["low"]
     assert {rate["episodes"] for rate in rates} == {16}
+    assert results["in_the_loop"].keys() == {"est_uncertainty", "est", "est_mse", "priv_on_estimate"}
+    estimating = {"est_uncertainty", "est", "est_mse", "priv_on_estimate"}
+    assert results["other_worlds"].keys() == {
+        "c=0.042", "c=0.060", "c=0.078", "support_offset=8mm", "mass=1-1.5", "mass=5-6", "mu=0.05-0.1", "mu=0.3-0.6", "box=-2cm",
+        "box=+2cm", "box=+2cm_wide", "noise=2x", "bias=2x", "force=0.7x", "force=1.3x", "late=1", "late=2", "surface=1.5",
+        "surface=4"}
+    for row, rates in results["other_worlds"].items():
+        sensing = row.partition("=")[0] in ("noise", "bias", "force", "late")
+        assert rates.keys() == (estimating if sensing else estimating | {"priv_on_state"})
+        assert all(rate.keys() == {"mean", "low", "high", "episodes"} and rate["episodes"] == 2 for rate in rates.values())
     assert results["contact_switches"].keys() == {"priv_on_state", "est_uncertainty"}
     for row in results["contact_switches"].values():
         assert row["mean"] >= 0 and row["std"] >= 0 and row["episodes"] == 16
@@ -241,7 +251,8 @@ def test_a_second_run_does_nothing(study, call):
 
 
 def test_published_nets_are_evaluated_as_in_their_study(study, call, tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("05_evaluate"), "DURATIONS", {"0": 0.0, "full": math.inf})  # for time
+    monkeypatch.setattr(measurements, "DURATIONS", {"0": 0.0, "full": math.inf})  # for time
+    monkeypatch.setattr(measurements, "other_worlds", lambda world: {})
     published = tmp_path / "published"
     for pattern in ("01_*/seed0/policy.safetensors", "02_*/seed0/test_*.npy", "03_*/*/seed0/estimator.safetensors",
                     "04_*/*/seed0/policy.safetensors", "0[134]*/**/metrics.csv"):
@@ -384,6 +395,16 @@ def test_a_stale_input_names_the_stage_to_redo(copy, call):
     assert is_mistake(*call(out, "04_train_policy"), "stale", "--force")
 
 
+def test_a_box_that_the_robot_is_not_made_for_is_one_line(copy, call):
+    out = copy(4)
+    for path in (out / "smoke").glob("0[34]*/**/config.json"):
+        record = json.loads(path.read_text())
+        record["world"]["box"] = [0.14, 0.10, 0.07]
+        files.save_json(path, record)
+    assert is_mistake(*call(out, "06_robot"), "--box (0.14, 0.1, 0.07)", "made for (0.12, 0.1, 0.07) only")
+    assert not (out / "smoke" / "06_robot").exists()
+
+
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_every_preset_is_a_config(script):
     module = importlib.import_module(script)
@@ -393,8 +414,9 @@ def test_every_preset_is_a_config(script):
 
 def test_mistakes_on_the_command_line_are_one_line(tmp_path):
     for field, value, words in (("--lerning-rate", "1", "--help"), ("--updates", "many", "--updates"),
-                                ("--checkpoints", "1", "say 2 to 7")):
-        process = start(tmp_path / "runs", "01_train_privileged", field, value)
+                                ("--checkpoints", "1", "say 2 to 7"), ("--mass", "2 1", "the least first"),
+                                ("--box", "0.3 0.2 0.07", "no room to start"), ("--starts", "here", "--starts")):
+        process = start(tmp_path / "runs", "01_train_privileged", field, *value.split())
         assert is_mistake(*process.communicate(), process.returncode, field, words)
     assert not (tmp_path / "runs").exists()
 

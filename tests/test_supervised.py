@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from common import supervised
+from common.task import World
 
 
 @pytest.mark.parametrize("slope", [1.0, 1e3])  # the gradient's norm is that, or clipped to 1
@@ -20,7 +21,7 @@ def test_a_step_counts_the_same_in_every_minibatch(slope, monkeypatch, tmp_path)
         return slope * net.weight.sum()
 
     run = SimpleNamespace(dir=tmp_path, load_resume=lambda: None, save_resume=lambda state: None, log=lambda **row: None,
-                          out_of_time=lambda: False)
+                          out_of_time=lambda: False, world=World())
     assert supervised.fit(run, net, loss, lambda: None, data, data, seed=0, sequences=8, epochs=1, lr=1e-3, lr_end=1e-3,
                           grad_norm=1.0, validation=64)
     gradients, counts = np.array(told).T

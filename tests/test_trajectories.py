@@ -132,11 +132,10 @@ def test_angles_are_compared_around_the_circle():
     assert table["rot_mean_abs_deg"] == pytest.approx(2, abs=1e-3) and table["rot_rmse_deg"] == pytest.approx(2, abs=1e-3)
 
 
-def test_vision_alone_has_the_errors_of_its_noise(monkeypatch):
-    monkeypatch.setattr(task, "OCCLUSION_START", 0.0)
+def test_vision_alone_has_the_errors_of_its_noise():
     states = np.zeros((3000 * 20, 7), np.float32)
-    table = statistics.error_table(
-        trajectories.measure((states, np.arange(0, 60_001, 20)), 3000, 500, 0, "cpu", lambda o: o[..., :4]))
+    data, seen = (states, np.arange(0, 60_001, 20)), task.World(occlusion_start=0.0)
+    table = statistics.error_table(trajectories.measure(data, 3000, 500, 0, "cpu", lambda o: o[..., :4], seen))
     assert table["trans_rmse_mm"] == pytest.approx(2.5 * math.sqrt(2), rel=0.03)
     assert table["trans_mean_l2_mm"] == pytest.approx(2.5 * math.sqrt(2) * math.sqrt(math.pi / 2), rel=0.03)
     assert table["rot_rmse_deg"] == pytest.approx(math.degrees(0.05 * math.sqrt(2)), rel=0.03)

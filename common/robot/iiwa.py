@@ -4,6 +4,8 @@ World frame: the workspace's (task.py), z up from the table. Tool frame: the fla
 """
 import numpy as np
 
+from common import task
+
 # Data sheet of the arm: axes and the way from each to the next, along z (m); limits of angle (rad) and speed (rad/s)
 AXES = np.array([[0, 0, 1], [0, 1, 0], [0, 0, 1], [0, -1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1]], float)
 LENGTHS = np.array([0.36, 0.0, 0.42, 0.0, 0.40, 0.0, 0.126])
@@ -14,7 +16,7 @@ SPEEDS = np.deg2rad([85.0, 85.0, 100.0, 75.0, 130.0, 135.0, 135.0])
 BASE = np.array([0.0, -0.5, 0.4])  # m
 FACING = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 TOOL = 0.25  # m, from the flange to the centre of the ball
-HEIGHT = 0.035  # m, of the ball's centre above the table: half of the box's height
+HEIGHT = task.World.pusher_height  # m, of the ball's centre above the table: half of the box's height
 DOWN = FACING @ np.diag([-1.0, 1.0, -1.0])  # rotation of a tool that points down
 POSTURE = np.deg2rad([0.0, 84.0, 0.0, -84.0, 0.0, 12.0, 0.0])  # over the middle of the workspace
 
