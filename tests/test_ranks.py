@@ -179,14 +179,13 @@ def test_bad_use_is_one_line_from_rank_0(tmp_path, words, told):
 
 
 def test_a_study_of_two_processes(study, tmp_path):
-    """02 and 05 give the bits of one process, from the same nets; 03 and 04 go through, and are evaluated."""
+    """02 and 05 give the bits of one process, from the same nets; 03 and 04 go through between them."""
     out, again = tmp_path / "runs", tmp_path / "again"
     copytree(study / "smoke" / "01_train_privileged", out / "smoke" / "01_train_privileged")
-    for script in SCRIPTS[1:5]:
+    for script in SCRIPTS[1:4]:
         ends(torchrun(ROOT / f"{script}.py", "smoke", "--out", out))
     for path in (study / "smoke" / "02_collect" / "seed0").glob("*.npy"):
         assert path.read_bytes() == (out / path.relative_to(study)).read_bytes()
-    assert "success_rate" in (out / "smoke/05_evaluate/seed0/results.json").read_text()
     copytree(study, again, ignore=lambda folder, names: [name for name in names if name.startswith(("05", "06"))])
     ends(torchrun(ROOT / "05_evaluate.py", "smoke", "--out", again))
     names = "smoke/05_evaluate/seed0/results.json", "smoke/05_evaluate/seed0/tables.md"
