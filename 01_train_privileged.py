@@ -4,14 +4,15 @@
 
 Writes runs/<preset>/01_train_privileged/seed<k>/: policy.safetensors, value.safetensors, checkpoint_*.safetensors
 (uniformly spaced over training, the untrained net first), metrics.csv, training.png, success_rate_priv.png (all seeds that
-are there). Resumes where it stopped.
+are there), starts.png (success over where the box starts). Resumes where it stopped.
 """
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import tyro
 
-from common import command, networks, plots, ppo, ranks, runs, stacks, training, weights
+from common import command, episodes, networks, plots, ppo, ranks, runs, stacks, training, weights
 from common.files import UserError
 from common.task import World
 
@@ -31,6 +32,19 @@ PRESETS = {
     "laptop": _QUICK | dict(updates=1000, checkpoints=100),
     "paper": dict(tolerance=4.0, near_share=0.8),  # without: nothing learned in 10 million steps (results/README.md)
 }
+
+
+def by_start(env, actor, seed, lists=8):
+    """Centres (N, 2) in m at which the boxes of some lists of episodes start, and success (N,) from there."""
+    centres, won = [], []
+
+    def keep(t, env):
+        if t == 0:
+            centres.append(env.unwrapped.box[:, :2])
+
+    for k in range(lists):
+        won.append(episodes.play(env, actor, 10**7 + lists * seed + k, record=keep)[0])
+    return np.concatenate(centres), np.concatenate(won)
 
 
 def main(cfg):
@@ -58,6 +72,7 @@ def main(cfg):
     weights.save(run.dir / "policy.safetensors", pi_priv)
     weights.save(run.dir / "value.safetensors", critic)
     plots.training(run.rows(), run.dir / "training.png")
+    plots.starts(*by_start(held_out, pi_priv, cfg.seed), run.dir / "starts.png")
     plots.success_rate_priv(cfg.roots, run.dir / "success_rate_priv.png")
     run.finish(["policy.safetensors", "value.safetensors", *names], **training.outcome(run))
     print(f"{run.dir}: pi_priv succeeds in {run.record['success']:.1%} of held-out episodes")

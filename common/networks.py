@@ -17,7 +17,7 @@ class Recurrent(nn.Module):
         self.inputs, self.outputs, self.sizes = inputs, outputs, tuple(sizes)
         self.encoder = nn.Linear(inputs, sizes[0])
         self.lstm = nn.LSTM(sizes[0], sizes[1])
-        self.head = nn.Sequential(nn.Linear(sizes[1], sizes[2]), nn.Tanh(), nn.Linear(sizes[2], outputs))
+        self.head = nn.Sequential(nn.Linear(sizes[1], sizes[2]), nn.Tanh(), speed.Float32Linear(sizes[2], outputs))
         for name, weight in self.named_parameters():  # larger features than torch's default: learning starts sooner
             if weight.ndim == 1:
                 nn.init.zeros_(weight)
@@ -28,7 +28,7 @@ class Recurrent(nn.Module):
     def forward(self, x, hidden=None):
         """Outputs (T, B, outputs) float32 and the next hidden state of inputs (T, B, inputs); no hidden state is zeros."""
         z, hidden = self.lstm(torch.tanh(self.encoder(x)), hidden)
-        return self.head(z).float(), hidden
+        return self.head(z), hidden
 
     def initial(self, batch, device=None):
         return tuple(torch.zeros(1, batch, self.sizes[1], device=device) for _ in range(2))
@@ -84,7 +84,8 @@ class Estimator(nn.Module):
         self.lstm = speed.EvenLSTM(9, sizes[0])
         nn.init.ones_(self.lstm.bias_ih_l0[sizes[0]:2 * sizes[0]])  # the forget gates begin open
         widths = (*sizes, 8 if likelihood else 4)
-        self.layers = nn.ModuleList([nn.Linear(a, b) for a, b in zip(widths, widths[1:])])
+        kinds = nn.Linear, nn.Linear, speed.Float32Linear
+        self.layers = nn.ModuleList([kind(a, b) for kind, a, b in zip(kinds, widths, widths[1:])])
 
     def head(self, z, generator=None):
         """Poses (..., 4) and log-variances (..., 4) or None of features (..., H), with a fresh dropout mask each call."""
@@ -92,7 +93,7 @@ class Estimator(nn.Module):
             z = layer(speed.dropout(z, self.dropout, generator))  # at training and testing time
             if i < 2:
                 z = torch.tanh(z)
-        q, log_var = z.float().split(4, -1) if self.likelihood else (z.float(), None)
+        q, log_var = z.split(4, -1) if self.likelihood else (z, None)
         return q, log_var.clamp(*LOG_VAR) if self.likelihood else None
 
     def forward(self, o, hidden=None, steps=slice(None), generator=None):

@@ -20,6 +20,7 @@ class ObservationModel:
 
     def __init__(self, num, seed=0, occlusion=None, world=World()):
         self.num, self.occlusion, self.world = num, occlusion, world
+        self.deviation = np.array(world.noise, np.float32)
         self.bias, self.held = np.zeros((num, 5), np.float32), np.zeros((num, 3), np.float32)  # SI units
         self.frames = deque(np.zeros((world.late, num, 3)))  # the boxes that the camera has not shown yet
         self.hidden = np.zeros(num)  # frames for which the running occlusion still hides the box
@@ -56,14 +57,15 @@ class ObservationModel:
 
     def _draw(self, rng, count):
         """Noise (count, 5), and how many frames to hide after a visible one: round(15 d) with probability p, else 0."""
-        noise = rng.standard_normal((count, 5), np.float32) * np.array(self.world.noise, np.float32)
+        noise = rng.standard_normal((count, 5), np.float32) * self.deviation
         start, seconds = rng.random(count), rng.normal(*self.world.occlusion, count)
         seconds = seconds if self.occlusion is None else self.occlusion
         return noise, np.where(start < self.world.occlusion_start, np.maximum(np.round(task.RATE * seconds), 0), 0)
 
     def _add(self, state, error):
         noisy = state.astype(np.float32)
-        noisy[:, 5:] *= self.world.gain
+        if self.world.gain != 1:
+            noisy[:, 5:] *= self.world.gain
         noisy[:, [0, 1, 2, 5, 6]] += error
         return noisy
 

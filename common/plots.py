@@ -68,6 +68,19 @@ def success_rate_priv(roots, path):
     write_atomic(path, figure.savefig)
 
 
+def starts(centres, success, path):
+    """Success over where the box's centre starts: centres (N, 2) in m, success (N,)."""
+    figure, ax = new(6, 3)
+    edges = [np.linspace(-half, half, count + 1) for half, count in zip(task.HALF, (20, 10))]
+    tried, won = (np.histogram2d(*centres.T, edges, weights=weights)[0] for weights in (None, success))
+    rate = 100 * np.divide(won, tried, out=np.full_like(won, np.nan), where=tried > 0)  # white where none started
+    image = ax.pcolormesh(*edges, rate.T, vmin=0, vmax=100, cmap="viridis")
+    figure.colorbar(image, label=SUCCESS_AXIS["ylabel"])
+    ax.grid(False)
+    ax.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", title=f"where the box's centre starts, {len(success):,} episodes")
+    write_atomic(path, figure.savefig)
+
+
 def training(rows, path):
     """What PPO told of every update, in eight panels; rows of the metrics of 01 or 04."""
     figure, axes = new(11, 5, 2, 4, sharex=True)

@@ -62,6 +62,14 @@ def _bfloat16(device, enabled):
     return torch.autocast(device.type, torch.bfloat16, enabled=enabled, cache_enabled=False)
 
 
+class Float32Linear(nn.Linear):
+    """A linear layer in float32 under any autocast, for outputs: bfloat16 would round a value near 40 by up to 0.125."""
+
+    def forward(self, x):
+        with _bfloat16(x.device, enabled=False):
+            return super().forward(x.float())
+
+
 def dropout(x, p, generator=None):
     """F.dropout, p rounded to 256ths, with a random byte an element: six times as fast on a CPU, where masks cost most."""
     drop = min(round(256 * p), 255)

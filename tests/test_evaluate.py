@@ -297,11 +297,13 @@ def test_every_figure_is_drawn_with_whatever_runs_there_are(tmp_path, short):
     plots.occlusion_duration(results["occlusion_duration"], tmp_path / "occlusion_duration.png")
     plots.sim(tmp_path / "sim.png")
     plots.other_worlds(results, tmp_path / "other_worlds.png")
+    centres = np.random.default_rng(0).uniform(-1, 1, (2000, 2)) * task.HALF
+    plots.starts(centres, np.abs(centres[:, 1]) < 0.1, tmp_path / "starts.png")
     pair = {m: play.episode(evaluate.Measurement(m, 6, occlusion=math.inf), 1)
             for m in ("est_uncertainty", "priv_on_estimate")}
     plots.trajectory_with_uncertainty(pair, tmp_path / "trajectory.png", 3, 6, 1)
     images = sorted(tmp_path.glob("*.png"))
-    assert len(images) == 17 and all(min(shape(path)[:2]) >= 350 for path in images)
+    assert len(images) == 18 and all(min(shape(path)[:2]) >= 350 for path in images)
     assert not list(tmp_path.rglob(".*"))  # nothing half-written
 
 

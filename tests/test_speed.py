@@ -93,6 +93,33 @@ def test_nothing_is_cast_under_the_float32_fixture(float32):
         assert not torch.is_autocast_enabled("cpu") and small()(torch.randn(2, 3, 9))[2][0].dtype == torch.float32
 
 
+def test_outputs_are_not_rounded_to_bfloat16(monkeypatch):
+    """A value net's 40.01 and 40.05 are two numbers, and so are an estimate's of two places 0.1 mm apart."""
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
+    nets = {"head.2": networks.value(8, (16, 16, 16)), "layers.2": networks.Estimator((16, 16, 16), dropout=0.0)}
+    for name, net in nets.items():
+        with torch.no_grad():
+            net.get_submodule(name).bias += 40.01
+            x = torch.zeros(1, 1, 9 if name == "layers.2" else 8)
+            with speed.autocast("cpu"):
+                first = net(x)[0]
+                net.get_submodule(name).bias += 0.04
+                second = net(x)[0]
+        assert first.dtype == torch.float32
+        torch.testing.assert_close(second - first, torch.full_like(first, 0.04), rtol=0, atol=1e-4)
+
+
+def test_a_layer_in_float32_is_that_layer(monkeypatch):
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
+    layer, x = speed.Float32Linear(16, 8), torch.randn(5, 16)
+    plain = layer(x)
+    with speed.autocast("cpu"):
+        assert layer(x).equal(plain) and layer(x.bfloat16()).dtype == torch.float32
+    loss = layer(x.bfloat16().requires_grad_()).sum()
+    loss.backward()
+    assert layer.weight.grad.dtype == torch.float32
+
+
 # Dropout
 
 

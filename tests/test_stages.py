@@ -26,7 +26,7 @@ POLICIES = {"est_uncertainty", "est", "est_mse", "end_to_end", "behavior_cloning
 OUTPUTS = {
     "01_train_privileged/seed0": ["policy.safetensors", "value.safetensors", "checkpoint_000.safetensors",
                                   "checkpoint_001.safetensors", "checkpoint_002.safetensors", "training.png",
-                                  "success_rate_priv.png"],
+                                  "success_rate_priv.png", "starts.png"],
     "02_collect/seed0": [file for name in SETS for file in trajectories.files(name)] + ["success.png"],
     "03_train_estimator/ours/seed0": ["estimator.safetensors", "likelihood_loss.png", "passes.json", "passes.png"],
     "03_train_estimator/likelihood/seed0": ["estimator.safetensors", "likelihood_loss.png", "passes.json"],
