@@ -214,7 +214,7 @@ def test_the_arm_pushes_the_box_as_the_training_world_does():
     """The same push at 150 steps a second and at 15, to a millimetre and a degree."""
     for offset in (-0.02, 0.0, 0.03):
         arm, worlds = placed(pusher=(-0.08, offset)), simulator.Worlds(1)
-        worlds.place(np.arange(1), np.zeros((1, 3)), np.array([[-0.08, offset]]), {k: np.array([v]) for k, v in DYNAMICS.items()})
+        worlds.place(np.arange(1), np.zeros((1, 3)), np.array([[-0.08, offset]]), arm.worlds.dynamics)
         for _ in range(30):
             list(drive(arm, (0.05, 0.0), 1))
             worlds.step(np.array([[0.05, 0.0]]))

@@ -1,6 +1,5 @@
 """What stage 06 needs of an arm and a camera, a simulated arm behind it, and any OpenCV video source as the camera."""
 import threading
-import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,8 @@ from common.robot import iiwa, ik, scene
 class Arm(Protocol):
     """The five methods that attach an arm with a force sensor and a camera; SI units, times of time.monotonic().
 
-    Joints and wrench are read and `command` is called 150 times a second: readings are at most 50 ms old, no method waits.
+    Joints and wrench are read and `command` is called 150 times a second by one thread, `grab` 15 times by another, and `stop`
+    by either, never within a `command`: readings are at most 50 ms old, no method waits.
     """
 
     def read_joints(self) -> tuple[float, np.ndarray]:
@@ -46,7 +46,7 @@ class Gaps:
     servo_lag: float = 0.02  # time constant in s of the joints' first-order response
     tool_mass: float = 0.3  # kg beyond the force sensor, whose inertia it feels (the paper's limitation)
     force_bias: float = 0.7  # standard deviation of its bias in N, drawn once a run (tab. occlusion_and_noise_params)
-    force_noise: float = 0.7  # standard deviation of each reading of the force sensor in N (tab. occlusion_and_noise_params)
+    force_noise: float = 0.7  # standard deviation in N of a control step's mean force (tab. occlusion_and_noise_params)
 
 
 class SimulatedArm:
@@ -63,7 +63,7 @@ class SimulatedArm:
         self.points, self.rotation = iiwa.chain(self.joints)[1:]
         self.velocity = self.acceleration = np.zeros(3)  # of the ball
         self.error = rng.normal(0, [g.hand_eye_mm / 1e3] * 3 + [np.deg2rad(g.hand_eye_deg)] * 3)
-        self.bias = rng.normal(0, g.force_bias, 3)  # N
+        self.bias, self.noise = rng.normal(0, g.force_bias, 3), rng.normal(0, g.force_noise, 3)  # N
         self.past = deque(maxlen=1 + round(g.latency * ik.QP_RATE / task.RATE))
         self.remember()
 
@@ -83,7 +83,7 @@ class SimulatedArm:
 
     def read_wrench(self):
         felt = np.append(self.worlds.force[0], 0.0) - self.gaps.tool_mass * self.acceleration
-        return self.time, self.rotation.T @ felt + self.bias + self.rng.normal(0, self.gaps.force_noise, 3)
+        return self.time, self.rotation.T @ felt + self.bias + self.noise
 
     def grab(self):
         time, box, points, rotation, covered = self.past[0]
@@ -98,6 +98,8 @@ class SimulatedArm:
         velocity = ik.QP_RATE * (self.points[7] - before)
         self.acceleration, self.velocity = ik.QP_RATE * (velocity - self.velocity), velocity
         self.worlds.step(ik.QP_RATE * (self.points[7:, :2] - self.worlds.pusher))
+        if round(self.time * ik.QP_RATE) % (ik.QP_RATE // task.RATE) == 1:  # one draw a control step, and no mean makes it less
+            self.noise = self.rng.normal(0, self.gaps.force_noise, 3)
         self.remember()
 
     def stop(self):
@@ -129,16 +131,3 @@ class VideoCamera:
 
     def grab(self):
         return self.newest if self.live else self.read()
-
-
-def pacer(on):
-    """wait(), which sleeps until the next QP step is due, and makes up for a late one; wait.slept counts the seconds slept."""
-    def wait():
-        now = time.perf_counter()
-        wait.due = max(wait.due + 1 / ik.QP_RATE, now - 1 / task.RATE)
-        if on and wait.due > now:
-            time.sleep(wait.due - now)
-            wait.slept += wait.due - now
-
-    wait.due, wait.slept = time.perf_counter(), 0.0
-    return wait
