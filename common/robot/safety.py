@@ -77,7 +77,7 @@ class Guarded:
         mine = self._lock.acquire(timeout=0.1)  # no longer: a driver may hang in its command
         try:
             self.arm.stop()
-        except Exception as error:
+        except BaseException as error:
             failure = f"the arm's own stop() failed ({type(error).__name__}: {error})"
             self.stopped = self.stopped if failure in self.stopped else f"{failure}; {self.stopped}"
         finally:
@@ -170,6 +170,7 @@ class Guarded:
 
     def command(self, velocity):
         """Joint velocities (7,) in rad/s, or zero where the program was not solved (None)."""
+        self.check()
         self._unsolved = self._unsolved + 1 if velocity is None else 0
         self.require(self._unsolved < UNSOLVED, f"{UNSOLVED} programs in a row were not solved")
         velocity = np.zeros(7) if velocity is None else velocity
