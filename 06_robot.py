@@ -21,7 +21,7 @@ from common import belief, command, networks, observation, plots, runs, speed, s
 from common.env import PushVectorEnv
 from common.files import UserError, save_json, write_atomic
 from common.progress import bar
-from common.robot import controller, hardware, iiwa, runlog, safety, scene, tags, views
+from common.robot import controller, hardware, runlog, safety, scene, tags, views
 
 SCENARIOS = ("natural", "hand_5s", "hand_full")
 PATIENCE = 5 * task.RATE  # ticks to wait for the first sight
@@ -80,16 +80,17 @@ def prepare(arm, cfg, scenario, k):
     while True:  # a start of the study from which the camera sees the box
         world.reset(seed=int(rng.integers(2**31)))
         arm.place(rng, world.box[0], world.pusher[0], world.dynamics, hand)
-        if tags.Tracker().update(arm.grab()[1], scene.wrist_camera(arm.points, arm.rotation)).seen is not None:
+        if tags.Tracker().update(arm.grab()[1], scene.wrist_camera(arm.model, arm.joints)).seen is not None:
             return hand
 
 
 def sense(arm, tracker):
     """grab -> track. The first columns of a tick's row: see runlog.log_of."""
     (taken, image), (now, q) = arm.grab(), arm.joints
-    _, points, rotation = iiwa.chain(q)
-    sight = tracker.update(image, scene.wrist_camera(*iiwa.chain(arm.joints_then(taken))[1:]))
-    return dict(time=now, joints=q, pusher=points[7, :2], force=(rotation @ arm.force)[:2], image=image, **vars(sight))
+    _, points, rotation = arm.model.chain(q)
+    sight = tracker.update(image, scene.wrist_camera(arm.model, arm.joints_then(taken)))
+    return dict(time=now, joints=q, points=points, pusher=points[-1, :2], force=(rotation @ arm.force)[:2], image=image,
+                **vars(sight))
 
 
 def think(f, pi, passes, row, memory):
@@ -136,7 +137,7 @@ def control(drive, f, pi, cfg, hand, rows):
         waited = drive.tick()
         row |= dict(unsolved=drive.unsolved, busy=time.perf_counter() - began - waited)
         rows.append(row)
-        box, pusher = arm.arm.box if simulated else row["estimated"], iiwa.chain(arm.joints[1])[1][7, :2]
+        box, pusher = arm.arm.box if simulated else row["estimated"], arm.model.chain(arm.joints[1])[1][-1, :2]
         certain = certain + 1 if task.reached(box) else 0
         if certain >= (1 if simulated else CERTAIN):
             return "success" if simulated else "success by estimate"

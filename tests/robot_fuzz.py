@@ -17,7 +17,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent))
 from common import task
 from common.progress import bar
-from common.robot import controller, iiwa, ik, safety
+from common.robot import controller, ik, safety
+from common.robot.iiwa import IIWA
+from common.robot.model import Model
 
 RUN = 60  # ticks at most
 SLACK = 1.1  # the guard knows the arm by its readings, of which small errors cannot be seen
@@ -33,8 +35,8 @@ def shapes(rng, x):
 class Arm:
     """Moves as it is told, at once. `must` names a fault after which it may not be told to move; `unsafe` collects what was."""
 
-    def __init__(self, rng, start, rate):
-        self.rng, self.rate, self.joints, self.clock = rng, rate, start.copy(), 0.0
+    def __init__(self, model, rng, start, rate):
+        self.model, self.rng, self.rate, self.joints, self.clock = model, rng, rate, start.copy(), 0.0
         self.stopped, self.must, self.faults, self.unsafe, self.equal, self.stale = False, "", 0, [], 0, 0
         self.kept, self.since, self.image, self.frozen = (0.0, start.copy()), 0, -1, False
 
@@ -65,7 +67,7 @@ class Arm:
             if kind in ("jump", "small"):
                 i, most = self.rng.integers(len(q)), safety.OVERSPEED * safety.SENSOR_AGE
                 size = most * (1 + self.rng.random()) if kind == "jump" else self.rng.uniform(0, 0.5) / ik.QP_RATE
-                q[i] += self.rng.choice([-1, 1]) * iiwa.SPEEDS[i] * size
+                q[i] += self.rng.choice([-1, 1]) * self.model.speeds[i] * size
             if kind == "backward":
                 time -= self.rng.choice([1e-3, 0.1, 1e3])
             if kind in ("value", "shape", "time", "jump"):
@@ -116,17 +118,17 @@ class Arm:
         moves = velocity.shape != self.joints.shape or bool(velocity.any())
         if moves and (self.stopped or self.must):
             self.unsafe.append(f"moved after {'a stop' if self.stopped else self.must}")
-        if not np.isfinite(velocity).all() or (np.abs(velocity) > 1.001 * iiwa.SPEEDS).any():
+        if not np.isfinite(velocity).all() or (np.abs(velocity) > 1.001 * self.model.speeds).any():
             self.unsafe.append(f"joint speeds {velocity}")
             return
-        axes, points, _ = iiwa.chain(self.joints)
-        tip = iiwa.jacobian(axes, points)[:3] @ velocity
+        axes, points, _ = self.model.chain(self.joints)
+        tip = self.model.jacobian(axes, points)[:3] @ velocity
         if np.linalg.norm(tip) > SLACK * safety.TIP or np.linalg.norm(tip[:2]) > SLACK * safety.TIP_XY:
             self.unsafe.append(f"pusher at {tip} m/s")
         self.joints = self.joints + velocity / ik.QP_RATE
-        place = iiwa.chain(self.joints)[1][7]
-        beyond, rise = (np.abs(place[:2]) > safety.BORDER + 0.002).any(), abs(place[2] - iiwa.HEIGHT)
-        if moves and (beyond or rise > safety.HEIGHT_GAP + 0.002 or (np.abs(self.joints) > iiwa.LIMITS).any()):
+        place = self.model.chain(self.joints)[1][-1]
+        beyond, rise = (np.abs(place[:2]) > safety.BORDER + 0.002).any(), abs(place[2] - self.model.height)
+        if moves and (beyond or rise > safety.HEIGHT_GAP + 0.002 or (np.abs(self.joints) > self.model.limits).any()):
             self.unsafe.append(f"at {place} m, {np.rad2deg(self.joints)} degrees")
         self.clock += 1 / ik.QP_RATE
         self.raised("command")
@@ -140,42 +142,43 @@ def remembered(function):
     """The last results of a function of an array: guard, solver and oracle ask for the same ones."""
     known = {}
 
-    def of(q):
+    def of(model, q):
         if len(known) > 50:
             known.clear()
-        key = q.tobytes()
+        key = model, q.tobytes()
         if key not in known:
-            known[key] = function(q)
+            known[key] = function(model, q)
         return known[key]
     return of
 
 
 def solver(rng, rate, real):
     """The quadratic program, or the same velocities without its limits, at a fifth of the time; each fails at random."""
-    def solve(q, velocity):
+    def solve(model, q, velocity):
         if rng.random() < rate:
-            return [None, None, np.full(7, np.nan), rng.normal(0, 10 ** rng.uniform(-2, 3), 7)][rng.integers(4)]
+            return [None, None, np.full(len(q), np.nan), rng.normal(0, 10 ** rng.uniform(-2, 3), len(q))][rng.integers(4)]
         if real:
-            return program(q, velocity)
-        axes, points, rotation = iiwa.chain(q)
-        wanted = np.concatenate([velocity, [10 * (iiwa.HEIGHT - points[7, 2])], 10 * iiwa.turned(rotation)])
-        j = iiwa.jacobian(axes, points)
+            return program(model, q, velocity)
+        axes, points, rotation = model.chain(q)
+        wanted = np.concatenate([velocity, [10 * (model.height - points[-1, 2])], 10 * model.turned(rotation)])
+        j = model.jacobian(axes, points)
         return j.T @ np.linalg.solve(j @ j.T, wanted)
 
     program = ik.solve
     return solve
 
 
-def fuzz(ticks, seed):
-    """Returns how many ticks had a fault, how often each reason stopped the arm, unsafe commands, other exceptions than Stop."""
+def fuzz(ticks, seed=0, model=IIWA):
+    """Returns how many ticks had a fault, how often each reason stopped the arm, unsafe commands, exceptions but Stop."""
     rng, played, faulty, reasons, unsafe, escaped = np.random.default_rng(seed), 0, 0, Counter(), [], []
-    starts = [iiwa.joints_at(xy) for xy in rng.uniform(-1, 1, (50, 2)) * task.HALF]
-    wall, program, chain, progress = safety.wall, ik.solve, iiwa.chain, bar(ticks, "fuzz", unit="tick")
-    iiwa.chain = remembered(chain)
+    starts = [model.joints_at(xy) for xy in rng.uniform(-1, 1, (50, 2)) * task.HALF]
+    wall, program, chain, progress = safety.wall, ik.solve, Model.chain, bar(ticks, "fuzz", unit="tick")
+    Model.chain = remembered(chain)
+    zeros, small = np.zeros(len(model.limits)), np.full(len(model.limits), 0.01)
     try:
         while played < ticks:
             rate = 10 ** rng.uniform(-3, -1)
-            arm = Arm(rng, starts[rng.integers(50)], rate)
+            arm = Arm(model, rng, starts[rng.integers(50)], rate)
             safety.wall = SimpleNamespace(monotonic=lambda: arm.clock)
             ik.solve = solver(rng, 0.3 * rate, rng.random() < 0.05)
             before = played
@@ -195,7 +198,7 @@ def fuzz(ticks, seed):
             except BaseException as error:
                 escaped.append(repr(error))
             arm.must = arm.must or "the end"
-            for late in (np.zeros(7), np.full(7, 0.01)) if played > before else ():  # as a thread that has not noticed
+            for late in (zeros, small) if played > before else ():  # as a thread that has not noticed
                 try:
                     guard.command(late)
                 except safety.Stop:
@@ -203,7 +206,7 @@ def fuzz(ticks, seed):
             unsafe += arm.unsafe
             progress.update(played - before)
     finally:
-        safety.wall, ik.solve, iiwa.chain = wall, program, chain
+        safety.wall, ik.solve, Model.chain = wall, program, chain
     return SimpleNamespace(ticks=played, faulty=faulty, reasons=reasons, unsafe=unsafe, escaped=escaped)
 
 

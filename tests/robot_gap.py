@@ -34,7 +34,7 @@ def main(cfg):
     for k in bar(logs, "starts", unit="run"):
         robot.prepare(arm, cfg, "natural", k)
         dynamics = {name: value[0] for name, value in arm.worlds.dynamics.items()}
-        starts.append({"box": arm.box.copy(), "pusher": arm.points[7, :2]} | dynamics)
+        starts.append({"box": arm.box.copy(), "pusher": arm.points[-1, :2]} | dynamics)
     starts = {key: np.array([start[key] for start in starts]) for key in starts[0]}
     share = statistics.robot_runs({"natural": logs})["natural"]["occluded_share"]
     seconds = share / (1 - share) / task.OCCLUSION_START / task.RATE

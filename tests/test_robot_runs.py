@@ -10,10 +10,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from six_joints import SIX
 from test_robot import placed
 
 from common import belief, command, networks, runs, stacks, symmetry, task, weights
-from common.robot import controller, hardware, iiwa, ik, safety, scene, tags
+from common.robot import controller, hardware, ik, safety, scene, tags
+from common.robot.iiwa import IIWA
 
 UNUSED = itertools.count(1000)  # seeds
 
@@ -120,12 +122,18 @@ class Forced(Faulty):
 
 class JointAtLimit(Faulty):
     def read_joints(self):
-        return self.time, np.where([0, 0, 0, self.wrong, 0, 0, 0], -iiwa.LIMITS, self.joints)
+        return self.time, np.where(self.wrong * (np.arange(len(self.joints)) == 3), -self.model.limits, self.joints)
 
 
 class Beyond(Faulty):
     def read_joints(self):
-        return self.time, iiwa.joints_at([0.32, 0.0]) if self.wrong else self.joints.copy()
+        return self.time, self.model.joints_at([0.32, 0.0]) if self.wrong else self.joints.copy()
+
+
+class TooFast(Faulty):
+    def read_joints(self):
+        last = np.arange(len(self.joints)) == len(self.joints) - 1
+        return self.time, self.joints + 1.2 * self.wrong * last * self.model.speeds / ik.QP_RATE
 
 
 class JointsOld(Faulty):
@@ -135,7 +143,7 @@ class JointsOld(Faulty):
 
 class Lifted(Faulty):
     def read_joints(self):
-        return self.time, self.joints - [0, 0.02 * self.wrong, 0, 0, 0, 0, 0]
+        return self.time, self.joints - 0.02 * self.wrong * (np.arange(len(self.joints)) == 1)
 
 
 class Broken(Faulty):
@@ -155,6 +163,7 @@ class CtrlC(Faulty):
 FAULTS = {JointsNaN: "joint angles", WrenchNaN: "wrench", ImageTimeNaN: "camera", CameraFrozen: "frozen",
           CameraStuck: "camera: the newest is", CameraGone: "no image", WrenchOld: "wrench: the newest is", Forced: "over 40 N",
           JointAtLimit: "joint 4 is at its limit", Beyond: "beyond the border", JointsOld: "s old",
+          TooFast: "is over its speed",
           Lifted: "above its height", Broken: "BrokenPipeError in test_robot_runs.py", CtrlC: "Ctrl-C"}
 
 
@@ -164,8 +173,13 @@ def stopped_for_good(arm):
     return arm.stopped and not arm.speeds.any() and (arm.joints == before).all()
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
-def test_every_fault_stops_the_arm(robot, fault):
+OF_ANOTHER_ARM = (JointsNaN, JointAtLimit, Beyond, Lifted, TooFast)
+
+
+@pytest.mark.parametrize("fault, model", [*((fault, IIWA) for fault in FAULTS), *((fault, SIX) for fault in OF_ANOTHER_ARM)],
+                         ids=lambda x: x.__name__ if isinstance(x, type) else len(x.limits))
+def test_every_fault_stops_the_arm(robot, monkeypatch, fault, model):
+    monkeypatch.setattr(Faulty, "model", model)
     stdout, stderr, code, folder = robot("--arm", f"{__name__}:{fault.__name__}", "--scenario", "natural")
     assert code == 2 and len(mistakes(stderr)) == 1 and "Traceback" not in stderr
     assert mistakes(stderr)[0].startswith("error: arm stopped: ") and FAULTS[fault] in stderr
@@ -178,7 +192,7 @@ def test_every_fault_stops_the_arm(robot, fault):
 
 def test_an_arm_whose_programs_are_not_solved_stands_still_and_then_stops(robot, monkeypatch):
     solve = ik.solve
-    monkeypatch.setattr(ik, "solve", lambda q, v: None if Faulty.last.wrong else solve(q, v))
+    monkeypatch.setattr(ik, "solve", lambda *args: None if Faulty.last.wrong else solve(*args))
     _, stderr, code, _ = robot("--arm", f"{__name__}:Faulty", "--scenario", "natural")
     assert code == 2 and "3 programs in a row were not solved" in stderr
     assert [command.any() for command in Faulty.last.commands[-3:]] == [True, False, False]
@@ -249,7 +263,7 @@ def test_a_run_is_logged_and_filmed_and_its_film_can_be_the_camera(robot, nets):
     for tick in range(ticks):
         _, image = camera.grab()
         joints = log["joints"][max(tick - 1, 0)]
-        sight = tracker.update(image, scene.wrist_camera(*iiwa.chain(joints)[1:]))
+        sight = tracker.update(image, scene.wrist_camera(IIWA, joints))
         if log["age"][tick] == 0 and sight.age == 0 and tick:
             misses.append(np.linalg.norm(sight.seen[:2] - log["seen"][tick, :2]))
     assert np.median(misses) < 1e-3 and camera.grab()[1] is None
@@ -299,6 +313,8 @@ def test_the_same_seed_plays_the_same_run(robot):
 
 class Driver:
     """A SimulatedArm that the program does not know for one."""
+
+    model = IIWA
 
     def __init__(self, config):
         self.simulated = placed(box=(0.0, 0.03, 0.2), pusher=(-0.09, 0.0))
@@ -402,3 +418,9 @@ def test_a_mistake_does_not_keep_the_right_command_from_starting(robot):
     assert robot("--scenario", "natural", seed=21)[2] == 0
     stdout, _, code, folder = robot("--scenario", "hand_full", "--runs", "2", seed=21)
     assert code == 0 and {path.stem for path in folder.glob("*.npz")} == {"natural_000", "hand_full_000", "hand_full_001"}
+
+
+def test_an_arm_of_six_joints_plays_a_run(robot):
+    _, _, code, folder = robot("--arm", "six_joints:SixJoints", "--scenario", "natural")
+    log = np.load(folder / "natural_000.npz")
+    assert code == 0 and log["joints"].shape[1] == 6 and not log["unsolved"].any() and log["ended"] != "stopped"

@@ -42,7 +42,7 @@ class Controller:
         if self.thread:
             self.thread.join(2 * SILENCE)
             self.arm.require(not self.thread.is_alive(), "the control thread hangs")
-        self.arm.command(np.zeros(7))
+        self.arm.command(np.zeros(len(self.arm.model.limits)))
 
     def aim(self, velocity):
         """The target from now on: the pusher's velocity (2,) in m/s."""
@@ -66,7 +66,7 @@ class Controller:
             self._step(lambda: None)
 
     def _step(self, wait):
-        speeds = ik.solve(self.arm.joints[1], self.target)
+        speeds = ik.solve(self.arm.model, self.arm.joints[1], self.target)
         self.unsolved += speeds is None
         self.arm.command(speeds)
         wait()

@@ -12,7 +12,7 @@ def log_of(rows, ended):
     `seen` is the last fit of the tags, `age` how many frames ago that was, `residual` (m) of this frame's; `sigma` is of x, y,
     sin, cos as the nets have them; `covered` is the hand; `unsolved` counts programs without a solution; `busy` is computing.
     """
-    kept = [key for key in (rows[0] if rows else ()) if key not in ("corners", "image")]
+    kept = [key for key in (rows[0] if rows else ()) if key not in ("corners", "image", "points")]
     return {"ended": np.array(ended)} | {key: np.array([row[key] for row in rows]) for key in kept}
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from common import task
 from common.files import UserError
-from common.robot import iiwa, ik, scene
+from common.robot import ik, scene
 
 FORCE, PEAK = 40.0, 100.0  # N: of the mean over a control step, and of one reading
 SENSOR_AGE, CAMERA_AGE = 0.05, 0.5  # s, of the newest joint angles and wrench, and of the newest image
@@ -65,6 +65,11 @@ class Guarded:
             self.stopped = f"arm stopped: {SIGNALS[number]}"
             raise KeyboardInterrupt
 
+    @property
+    def model(self):
+        """The arm's model.Model."""
+        return self.arm.model
+
     def begin(self):
         """A run begins: what was read before does not count."""
         self._joints, self._forces = deque(maxlen=ik.QP_RATE), deque(maxlen=ik.QP_RATE // task.RATE)  # a second's, a tick's
@@ -103,22 +108,23 @@ class Guarded:
             self.stop(reason)
 
     def read_joints(self):
-        """Time and joint angles (7,) in rad."""
+        """Time and joint angles (n,) in rad."""
         time, q = self.arm.read_joints()
-        self.require(np.shape(q) == (7,) and np.isfinite(time) and np.isfinite(q).all(), "joint angles: not seven numbers")
+        whole = np.shape(q) == self.model.limits.shape and np.isfinite(time) and np.isfinite(q).all()
+        self.require(whole, f"joint angles: not {len(self.model.limits)} numbers")
         q = np.array(q, float)
-        for i in np.flatnonzero(np.abs(q) > iiwa.LIMITS - JOINT_GAP):
+        for i in np.flatnonzero(np.abs(q) > self.model.limits - JOINT_GAP):
             self.stop(f"joint {i + 1} is at its limit, {np.rad2deg(q[i]):.1f} degrees")
-        axes, points, rotation = iiwa.chain(q)
-        self._jacobian = iiwa.jacobian(axes, points)[:3]
-        x, y, rise = points[7] - [0, 0, iiwa.HEIGHT]
-        tilt = np.arccos(np.clip((np.trace(rotation.T @ iiwa.DOWN) - 1) / 2, -1, 1))
+        axes, points, rotation = self.model.chain(q)
+        self._jacobian = self.model.jacobian(axes, points)[:3]
+        x, y, rise = points[-1] - [0, 0, self.model.height]
+        tilt = np.arccos(np.clip((np.trace(rotation.T @ self.model.down) - 1) / 2, -1, 1))
         self.require(abs(x) <= BORDER[0] and abs(y) <= BORDER[1], f"the pusher is beyond the border, at {x:.3f}, {y:.3f} m")
         self.require(abs(rise) <= HEIGHT_GAP and tilt <= TILT,
                      f"the pusher is {1e3 * rise:.1f} mm above its height and turned by {np.rad2deg(tilt):.1f} degrees")
         last, before = self._joints[-1] if self._joints else (time, q)
         within = np.clip(time - last, 1 / ik.QP_RATE, SENSOR_AGE)
-        for i in np.flatnonzero(np.abs(q - before) > OVERSPEED * iiwa.SPEEDS * within):
+        for i in np.flatnonzero(np.abs(q - before) > OVERSPEED * self.model.speeds * within):
             self.stop(f"joint {i + 1} is over its speed, {np.rad2deg(q - before)[i]:.1f} degrees in {within:.3f} s")
         if not self._joints or time > self._joints[-1][0]:
             self._joints.append((time, q))
@@ -129,11 +135,11 @@ class Guarded:
 
     @property
     def joints(self):
-        """Time and joint angles (7,) in rad that were read last."""
+        """Time and joint angles (n,) in rad that were read last."""
         return self._joints[-1]
 
     def joints_then(self, time):
-        """Joint angles (7,) at an earlier time, between those that were read."""
+        """Joint angles (n,) at an earlier time, between those that were read."""
         times, q = zip(*tuple(self._joints))
         return np.array([np.interp(time, times, angle) for angle in zip(*q)])
 
@@ -169,12 +175,12 @@ class Guarded:
         return time, self._image
 
     def command(self, velocity):
-        """Joint velocities (7,) in rad/s, or zero where the program was not solved (None)."""
+        """Joint velocities (n,) in rad/s, or zero where the program was not solved (None)."""
         self.check()
         self._unsolved = self._unsolved + 1 if velocity is None else 0
         self.require(self._unsolved < UNSOLVED, f"{UNSOLVED} programs in a row were not solved")
-        velocity = np.zeros(7) if velocity is None else velocity
-        self.require((np.abs(velocity) <= 1.001 * iiwa.SPEEDS).all(), "a joint velocity is not within its limit")
+        velocity = np.zeros(len(self.model.limits)) if velocity is None else velocity
+        self.require((np.abs(velocity) <= 1.001 * self.model.speeds).all(), "a joint velocity is not within its limit")
         tip = self._jacobian @ velocity
         speed, speed_xy = np.linalg.norm(tip), np.linalg.norm(tip[:2])
         self.require(speed <= TIP and speed_xy <= TIP_XY, f"the pusher would move at {speed:.3f} m/s")

@@ -3,7 +3,7 @@ import cv2
 import numpy as np
 
 from common import film, observation, task
-from common.robot import iiwa, scene
+from common.robot import scene
 
 FOUND = (60, 220, 60)
 
@@ -11,7 +11,7 @@ FOUND = (60, 220, 60)
 def panels(row, tick):
     """RGB images of a tick: from outside, by the robot's camera, from above; without a true pose the estimate stands for it."""
     box = row["estimated"] if np.isnan(row["true"]).any() else row["true"]
-    outside = scene.render(scene.OVERVIEW, box, iiwa.chain(row["joints"])[1], row["covered"], arm=True)
+    outside = scene.render(scene.OVERVIEW, box, row["points"], row["covered"], arm=True)
     seen = row["image"].copy()
     cv2.polylines(seen, list(np.round(16 * row["corners"]).astype(np.int32)), True, FOUND, 2, cv2.LINE_AA, 4)
     state, noisy, s_hat = (np.concatenate([pose, row["pusher"], row["force"]]) for pose in (box, row["seen"], row["estimated"]))
