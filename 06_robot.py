@@ -1,12 +1,14 @@
 """Stage 06: the policy on an arm with a camera, under natural and human-induced occlusions (sec. 6).
 
     python 06_robot.py [pretrained|smoke|quick|laptop|paper] [--weights DIR] [--scenario natural|hand_5s|hand_full|all]
-        [--runs n] [--video] [--seed k] [--realtime] [--think s] [--arm module:Class] [--camera source] [--print-tags]
+        [--runs n] [--video] [--seed k] [--realtime] [--view [port]] [--think s] [--arm module:Class] [--camera source]
+        [--print-tags]
 
 Reads est_uncertainty (04) and the estimator ours (03), of the same preset or in the folder --weights. Writes to
 runs/<preset>/06_robot/seed<k>/: summary.json, robot.png, a log <scenario>_<run>.npz a run and, with --video, two mp4 a run:
 the three views, and the camera alone. A rerun goes on with the next run. --print-tags only writes <out>/tags.pdf.
 """
+import contextlib
 import importlib
 import time
 from dataclasses import dataclass
@@ -21,7 +23,7 @@ from common import belief, command, networks, observation, plots, runs, speed, s
 from common.env import PushVectorEnv
 from common.files import UserError, save_json, write_atomic
 from common.progress import bar
-from common.robot import controller, hardware, runlog, safety, scene, tags, views
+from common.robot import controller, hardware, page, runlog, safety, scene, tags, views
 
 SCENARIOS = ("natural", "hand_5s", "hand_full")
 PATIENCE = 5 * task.RATE  # ticks to wait for the first sight
@@ -38,8 +40,9 @@ class Config(hardware.Gaps, command.Reader):
     think: float = command.setting(0.03, before=0.0)  # s that the simulated clock runs on while the program thinks; below 1/15
     arm: str = "simulated"  # module:Class of a real one, with the methods of hardware.Arm; it is given this config
     camera: str = ""  # device number, file or address of a camera that OpenCV opens, instead of the arm's own
+    view: tuple[int, ...] | None = None  # show the runs at http://127.0.0.1:8006, or another port; to join in, with --realtime
     print_tags: bool = False  # write the sheet of tags for the box, and nothing else
-    free: ClassVar = (*command.Reader.free, "scenario", "runs", "video", "realtime", "print_tags")
+    free: ClassVar = (*command.Reader.free, "scenario", "runs", "video", "realtime", "view", "print_tags")
 
 
 PRESETS = {
@@ -107,11 +110,11 @@ def think(f, pi, passes, row, memory):
     return symmetry.mirror(s_hat, sign)[0], action[0], (sign, hidden, recall)
 
 
-def control(drive, f, pi, cfg, hand, rows):
+def control(drive, f, pi, cfg, hand, rows, screen):
     """One run: grab -> track -> believe -> act -> aim, 15 times a second. Returns how it ended.
 
     `drive` is a controller.Controller, `hand` (from, to) in s for who covers the tags of a real arm; `rows` is a list that gets
-    a dict a tick.
+    a dict a tick, which the page.Page `screen` shows, if there is one.
     """
     arm, simulated = drive.arm, isinstance(drive.arm.arm, hardware.SimulatedArm)
     cues = {int(moment * task.RATE): f"now {word} the tags" for moment, word in zip(hand, ("cover", "uncover")) if moment < 60}
@@ -137,27 +140,33 @@ def control(drive, f, pi, cfg, hand, rows):
         waited = drive.tick()
         row |= dict(unsolved=drive.unsolved, busy=time.perf_counter() - began - waited)
         rows.append(row)
+        if screen:
+            screen.show(row, tick)
         box, pusher = arm.arm.box if simulated else row["estimated"], arm.model.chain(arm.joints[1])[1][-1, :2]
         certain = certain + 1 if task.reached(box) else 0
         if certain >= (1 if simulated else CERTAIN):
             return "success" if simulated else "success by estimate"
+        if simulated and arm.arm.ended:
+            return "ended on the page"
         if task.outside(box, pusher):
             return "out of the workspace"
     return "out of time"
 
 
-def perform(arm, f, pi, run, logs, scenario, k):
+def perform(arm, f, pi, run, logs, scenario, k, screen):
     """Run k of a scenario, its film and figure, and last its log, by which a rerun knows it; Stop where the arm was stopped."""
     rows, stop, name = [], None, f"{scenario}_{k:03d}"
     hand, threaded = prepare(arm.arm, run.cfg, scenario, k), run.cfg.realtime or not isinstance(arm.arm, hardware.SimulatedArm)
+    if screen:
+        screen.begin(f"{scenario}, run {k + 1}")
     try:
         with controller.Controller(arm, threaded, run.cfg.think) as drive:
-            ended = control(drive, f, pi, run.cfg, hand, rows)
+            ended = control(drive, f, pi, run.cfg, hand, rows, screen)
     except safety.Stop as reason:
         if isinstance(arm.arm, hardware.SimulatedArm) and isinstance(reason.__context__, KeyboardInterrupt):
             raise  # not the policy's failure: the same command plays the run again
         ended, stop = "stopped", reason
-    log = runlog.log_of(rows, ended)
+    log = runlog.log_of(rows, ended, getattr(arm.arm, "joined", False))
     if rows and run.cfg.video:
         views.write(rows, run.dir / f"{name}.mp4", run.dir / f"{name}_camera.mp4")
     others = [runlog.worth(other) for done in logs.values() for other in done.values() if "age" in other]
@@ -173,17 +182,28 @@ def perform(arm, f, pi, run, logs, scenario, k):
     return f"{name} {ended} after {len(rows) / task.RATE:.1f} s"
 
 
-def play(cfg, arm, f, pi, paths, scenarios):
+def check_begun(cfg, folder):
+    """UserError where the runs of a folder are of another arm."""
+    begun = (runs.record_of(cfg, folder) or {"settings": {}})["settings"]
+    names = [name for name in ("arm", "camera", "think", *vars(hardware.Gaps()))
+             if name in begun and begun[name] != runs.as_json(getattr(cfg, name))]
+    if names and not cfg.force:
+        raise UserError(f"{folder} has runs with another {', '.join(names)}: say another --seed, or --force to redo them")
+
+
+def play(cfg, arm, f, pi, paths, scenarios, screen):
     """The runs that are still to do of the scenarios, and their summary."""
     run = runs.Run(cfg, "06_robot", paths)
     logs = {scenario: runlog.read(run.dir, scenario) for scenario in SCENARIOS}
     todo = [(scenario, k) for scenario in scenarios for k in range(cfg.runs) if k not in logs[scenario]]
+    if cfg.video and len(todo) < len(scenarios) * cfg.runs:
+        print(f"--video: does nothing for {len(scenarios) * cfg.runs - len(todo)} finished runs, whose images are gone")
     if run.finished and not todo:
         print(f"{tables.robot(statistics.robot_runs(logs))}\n")
         return run.skip()
     progress = bar(len(todo), "06_robot", unit="run")
     for scenario, k in todo:
-        progress.set_postfix_str(perform(arm, f, pi, run, logs, scenario, k), refresh=False)
+        progress.set_postfix_str(perform(arm, f, pi, run, logs, scenario, k, screen), refresh=False)
         progress.update()
         if run.out_of_time():
             return run.stop()
@@ -206,14 +226,20 @@ def main(cfg):
     scenarios = SCENARIOS if cfg.scenario == "all" else (cfg.scenario,)
     if cfg.force and any(runlog.read(folder, other) for other in SCENARIOS if other not in scenarios):
         raise UserError(f"--force redoes all scenarios of {folder}: say --scenario all, or another --seed")
+    check_begun(cfg, folder)
     runs.claim(folder)  # before anything touches an arm that another process may drive
     # the first pass takes ten times as long as any other
     think(f, pi, cfg.passes, dict(seen=np.zeros(3), pusher=np.zeros(2), force=np.zeros(2), age=0), None)
-    with connect(cfg) as arm:
+    if cfg.view is not None and len(cfg.view) > 1:
+        raise UserError(f"--view {' '.join(map(str, cfg.view))}: one port")
+    with contextlib.nullcontext() if cfg.view is None else page.Page(*cfg.view) as screen, connect(cfg) as arm:
+        if screen:
+            screen.arm = arm
+            print(f"see http://127.0.0.1:{screen.server_port}")
         if cfg.camera:
             clock = (lambda: arm.arm.time) if isinstance(arm.arm, hardware.SimulatedArm) else time.monotonic
             arm.camera = hardware.VideoCamera(cfg.camera, clock, cfg.latency / task.RATE)
-        play(cfg, arm, f, pi, paths, scenarios)
+        play(cfg, arm, f, pi, paths, scenarios, screen)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
 """Rotations of the plane; distance between the pusher and the box, and the face that it touches, from Coal."""
+import threading
+
 import coal
 import numpy as np
 
@@ -9,6 +11,7 @@ _ball = coal.Sphere(RADIUS)
 _distance = coal.ComputeDistance(_box, _ball)
 _at_box, _at_ball = coal.Transform3s(), coal.Transform3s()
 _request, _result = coal.DistanceRequest(), coal.DistanceResult()
+_lock = threading.Lock()  # of these, which are everybody's
 
 
 def rotation(angle):
@@ -23,10 +26,10 @@ def nearest(box, pusher):
     The distance is negative in penetration; the point is in the box frame, in m.
     """
     in_box_frame = (rotation(-box[2]) * np.subtract(pusher[:2], box[:2])).sum(1)  # BLAS's product rounds as the machine likes
-    _at_ball.setTranslation(np.array([*in_box_frame, 0.0]))
-    _result.clear()
-    distance = _distance(_at_box, _at_ball, _request, _result)
-    return distance, _result.getNearestPoint1()[:2]
+    with _lock:
+        _at_ball.setTranslation(np.array([*in_box_frame, 0.0]))
+        _result.clear()
+        return _distance(_at_box, _at_ball, _request, _result), _result.getNearestPoint1()[:2]
 
 
 def face(point, last):

@@ -25,7 +25,7 @@ robot = importlib.import_module("06_robot")
 
 def main(cfg):
     folder = runs.run_folder(cfg.own, "06_robot", None, cfg.seed)
-    logs = runlog.read(folder, "natural")
+    logs = {k: log for k, log in runlog.read(folder, "natural").items() if statistics.counts(log)}
     if not logs:
         raise UserError(f"{folder}: no natural runs; run python 06_robot.py {cfg.preset} --scenario natural first")
     settings = runs.record_of(cfg, folder)["settings"]

@@ -219,7 +219,8 @@ def test_a_box_that_is_never_seen_ends_the_run_with_one_line(robot, monkeypatch)
     stdout, _, code, folder = robot("--scenario", "natural")
     assert code == 0 and "natural_000: box not seen for 5 s" in stdout
     assert np.load(folder / "natural_000.npz")["ended"] == "box not seen for 5 s"
-    assert json.loads((folder / "summary.json").read_text())["natural"]["tick_p99_ms"] is None
+    summary = json.loads((folder / "summary.json").read_text())["natural"]
+    assert summary["tick_p99_ms"] is None and summary["runs"] == 0 and summary["not_begun"] == 1 and "1 not begun" in stdout
 
 
 def test_a_run_goes_on_after_a_stop_and_counts_it(robot):
@@ -280,6 +281,20 @@ def test_force_deletes_no_other_scenario(robot):
     folder = robot("--scenario", "natural", seed=23)[3]
     _, stderr, code, _ = robot("--scenario", "hand_5s", "--force", seed=23)
     assert code == 2 and "--scenario all" in mistakes(stderr)[0] and (folder / "natural_000.npz").exists()
+
+
+def test_the_video_of_a_finished_run_is_said_to_do_nothing(robot):
+    assert "--video" not in robot("--scenario", "natural", seed=24)[0]
+    stdout, _, code, folder = robot("--scenario", "natural", "--video", seed=24)
+    assert code == 0 and "--video: does nothing for 1 finished runs" in stdout and not list(folder.glob("*.mp4"))
+
+
+@pytest.mark.parametrize("words", [("--arm", "six_joints:SixJoints"), ("--latency", "2"), ("--think", "0")])
+def test_another_arm_or_gap_needs_another_seed(robot, words):
+    folder = robot("--scenario", "natural", seed=25)[3]
+    _, stderr, code, _ = robot("--scenario", "natural", *words, seed=25)
+    assert code == 2 and f"another {words[0][2:]}: say another --seed" in mistakes(stderr)[0]
+    assert len(list(folder.glob("*.npz"))) == 1
 
 
 def test_a_damaged_log_is_named(robot):

@@ -1,5 +1,6 @@
 """What stage 06 needs of an arm and a camera, a simulated arm behind it, and any OpenCV video source as the camera."""
 import threading
+import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from common import simulator, task
+from common import geometry, simulator, task
 from common.files import UserError
 from common.robot import ik, scene
 from common.robot.iiwa import IIWA
@@ -64,6 +65,7 @@ class SimulatedArm:
     def place(self, rng, box, pusher, dynamics, hand=(np.inf, np.inf)):
         """Starts anew: box (3,), pusher (2,), dynamics as simulator.Worlds.place takes them, from when to when a hand (s)."""
         g, self.rng, self.time, self.hand = self.gaps, rng, 0.0, hand
+        self.joined, self.ended, self.held, self.nudges = False, False, 0.0, deque(maxlen=100)
         self.worlds.place(np.arange(1), box[None], pusher[None], dynamics)
         self.joints, self.speeds = self.model.joints_at(pusher), np.zeros(len(self.model.limits))
         self.points, self.rotation = self.model.chain(self.joints)[1:]
@@ -79,7 +81,7 @@ class SimulatedArm:
 
     @property
     def covered(self):
-        return self.hand[0] <= self.time < self.hand[1]  # whether a hand is over the tags
+        return self.hand[0] <= self.time < self.hand[1] or time.monotonic() < self.held  # whether a hand is over the tags
 
     def remember(self):
         self.past.append((self.time, self.box.copy(), self.joints, self.points, self.covered))
@@ -92,8 +94,8 @@ class SimulatedArm:
         return self.time, self.rotation.T @ felt + self.bias + self.noise
 
     def grab(self):
-        time, box, joints, points, covered = self.past[0]
-        return time, scene.photograph(scene.wrist_camera(self.model, joints, self.error), box, points, covered, self.rng)
+        taken, box, joints, points, covered = self.past[0]
+        return taken, scene.photograph(scene.wrist_camera(self.model, joints, self.error), box, points, covered, self.rng)
 
     def command(self, velocity):
         wanted, lag = np.zeros(len(self.joints)) if self.stopped else velocity, self.gaps.servo_lag
@@ -103,13 +105,28 @@ class SimulatedArm:
         _, self.points, self.rotation = self.model.chain(self.joints)
         velocity = ik.QP_RATE * (self.points[-1] - before)
         self.acceleration, self.velocity = ik.QP_RATE * (velocity - self.velocity), velocity
+        while self.nudges:
+            box = self.box + np.append(self.nudges.popleft(), 0.0)
+            if geometry.nearest(box, self.points[-1])[0] > 0 and not task.outside(box, self.worlds.pusher[0]):
+                self.worlds.place(np.arange(1), box[None], self.worlds.pusher, {})
         self.worlds.step(ik.QP_RATE * (self.points[-1:, :2] - self.worlds.pusher))
         if round(self.time * ik.QP_RATE) % (ik.QP_RATE // task.RATE) == 1:  # one draw a control step, and no mean makes it less
             self.noise = self.rng.normal(0, self.gaps.force_noise, 3)
         self.remember()
 
     def stop(self):
-        self.stopped, self.speeds = True, np.zeros(len(self.joints))
+        self.stopped, self.speeds = True, np.zeros(len(self.model.limits))
+
+
+    def join(self, what, way=()):
+        """Somebody "cover"s the tags for half a second, asks for the "next" run, or "nudge"s the box by (2,) m; any thread."""
+        self.joined = True
+        if what == "cover":
+            self.held = time.monotonic() + 0.5
+        if what == "next":
+            self.ended = True
+        if what == "nudge":
+            self.nudges.append(way)
 
 
 class VideoCamera:

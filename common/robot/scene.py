@@ -153,8 +153,8 @@ def render(camera, box, points, hand=False, arm=False):
         joints = [points[0], *(b for a, b in zip(points[:-2], points[1:-1]) if np.linalg.norm(b - a) > NEAR)]
         for a, b, wide in zip(joints[:-1], joints[1:], np.linspace(0.09, 0.06, len(joints) - 1)):
             _limb(image, camera, a, b, wide, wide - 0.01, STEEL)
-            if b is not joints[-1]:
-                _limb(image, camera, b, b, 0.6 * wide, 0.6 * wide, ORANGE)
+        for joint in joints[1:-1]:
+            _limb(image, camera, joint, joint, 0.045, 0.045, ORANGE)
     if hand:  # flat over the tags, its arm coming from +x
         palm = np.array([*box[:2], HAND])
         _limb(image, camera, palm + [0.02, 0, 0], palm + [0.45, 0.12, 0.12], 0.05, 0.045, SKIN)
