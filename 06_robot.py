@@ -182,18 +182,12 @@ def perform(arm, f, pi, run, logs, scenario, k, screen):
     return f"{name} {ended} after {len(rows) / task.RATE:.1f} s"
 
 
-def check_begun(cfg, folder):
-    """UserError where the runs of a folder are of another arm."""
-    begun = (runs.record_of(cfg, folder) or {"settings": {}})["settings"]
-    names = [name for name in ("arm", "camera", "think", *vars(hardware.Gaps()))
-             if name in begun and begun[name] != runs.as_json(getattr(cfg, name))]
-    if names and not cfg.force:
-        raise UserError(f"{folder} has runs with another {', '.join(names)}: say another --seed, or --force to redo them")
-
-
 def play(cfg, arm, f, pi, paths, scenarios, screen):
     """The runs that are still to do of the scenarios, and their summary."""
-    run = runs.Run(cfg, "06_robot", paths)
+    try:
+        run = runs.Run(cfg, "06_robot", paths)
+    except UserError as mistake:
+        raise UserError(f"{mistake}, or another --seed") from None
     logs = {scenario: runlog.read(run.dir, scenario) for scenario in SCENARIOS}
     todo = [(scenario, k) for scenario in scenarios for k in range(cfg.runs) if k not in logs[scenario]]
     if cfg.video and len(todo) < len(scenarios) * cfg.runs:
@@ -226,12 +220,9 @@ def main(cfg):
     scenarios = SCENARIOS if cfg.scenario == "all" else (cfg.scenario,)
     if cfg.force and any(runlog.read(folder, other) for other in SCENARIOS if other not in scenarios):
         raise UserError(f"--force redoes all scenarios of {folder}: say --scenario all, or another --seed")
-    check_begun(cfg, folder)
     runs.claim(folder)  # before anything touches an arm that another process may drive
     # the first pass takes ten times as long as any other
     think(f, pi, cfg.passes, dict(seen=np.zeros(3), pusher=np.zeros(2), force=np.zeros(2), age=0), None)
-    if cfg.view is not None and len(cfg.view) > 1:
-        raise UserError(f"--view {' '.join(map(str, cfg.view))}: one port")
     with contextlib.nullcontext() if cfg.view is None else page.Page(*cfg.view) as screen, connect(cfg) as arm:
         if screen:
             screen.arm = arm

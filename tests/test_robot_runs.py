@@ -293,7 +293,7 @@ def test_the_video_of_a_finished_run_is_said_to_do_nothing(robot):
 def test_another_arm_or_gap_needs_another_seed(robot, words):
     folder = robot("--scenario", "natural", seed=25)[3]
     _, stderr, code, _ = robot("--scenario", "natural", *words, seed=25)
-    assert code == 2 and f"another {words[0][2:]}: say another --seed" in mistakes(stderr)[0]
+    assert code == 2 and words[0][2:] in stderr and "or another --seed" in mistakes(stderr)[0]
     assert len(list(folder.glob("*.npz"))) == 1
 
 

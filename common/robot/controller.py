@@ -61,17 +61,14 @@ class Controller:
         self.arm.check()
         return time.perf_counter() - began
 
-    def _play(self, steps):
+    def _play(self, steps, wait=lambda: None):
         for _ in range(steps):
-            self._step(lambda: None)
-
-    def _step(self, wait):
-        speeds = ik.solve(self.arm.model, self.arm.joints[1], self.target)
-        self.unsolved += speeds is None
-        self.arm.command(speeds)
-        wait()
-        self.arm.read_joints()
-        self.arm.read_wrench()
+            speeds = ik.solve(self.arm.model, self.arm.joints[1], self.target)
+            self.unsolved += speeds is None
+            self.arm.command(speeds)
+            wait()
+            self.arm.read_joints()
+            self.arm.read_wrench()
 
     def _follow(self):
         """The thread: a Stop in it is the guard's, which tells the caller."""
@@ -86,7 +83,7 @@ class Controller:
         with contextlib.suppress(Stop):
             try:
                 while self.running:
-                    self._step(wait)
+                    self._play(1, wait)
                     steps += 1
                     if steps % STEPS == 0:
                         self.beat.set()

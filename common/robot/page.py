@@ -11,7 +11,6 @@ from common import draw, task
 from common.files import UserError
 from common.robot import views
 
-PORT = 8006
 HTML = """<!doctype html><meta charset="utf-8"><title>Pushing under occlusion</title>
 <style>body { font: 16px sans-serif; max-width: 960px; margin: 1em auto } img { width: 100%; user-select: none }
 button { font: inherit; padding: .5em 1em } #stop { background: #c33; color: white }</style>
@@ -26,21 +25,19 @@ async function follow() {
     const reply = await fetch("/frame"), image = await reply.blob()
     state.textContent = JSON.parse(reply.headers.get("State"))
     if (image.size) { URL.revokeObjectURL(view.src); view.src = URL.createObjectURL(image) }
-  } catch { state.textContent = "No answer: the program has ended, or hangs." }
+  } catch { state.textContent = "No answer: the program has ended." }
   setTimeout(follow, 60)
 }
 document.getElementById("stop").onclick = () => post("/stop")
 next.onclick = () => post("/next")
 cover.onpointerdown = () => covering = true
 view.onpointerdown = event => {
-  const scale = WIDTH / view.clientWidth
-  if (event.offsetX * scale < WIDTH / 2 && event.offsetY * scale > TOP) drag = event
+  if (event.offsetX < view.clientWidth / 2 && event.offsetY > view.clientWidth * TOP / WIDTH) drag = event
 }
 onpointermove = event => {
-  if (!drag) return
-  const metres = 2 * VIEW / view.clientWidth
-  way = [way[0] + (event.clientX - drag.clientX) * metres, way[1] - (event.clientY - drag.clientY) * metres]
-  drag = event
+  const metres = drag ? 2 * VIEW / view.clientWidth : 0
+  if (drag) way = [way[0] + (event.clientX - drag.clientX) * metres, way[1] - (event.clientY - drag.clientY) * metres]
+  drag = drag && event
 }
 onpointerup = onblur = () => { covering = false; drag = null }
 setInterval(() => {
@@ -60,10 +57,10 @@ class Page(ThreadingHTTPServer):
 
     daemon_threads, request_queue_size, arm, title, jpeg, latest = True, 64, None, "", b"", None
 
-    def __init__(self, port=PORT):
+    def __init__(self, port=8006, *more):
         try:
-            super().__init__(("127.0.0.1", port), Request)
-        except (OSError, OverflowError) as error:
+            super().__init__(("127.0.0.1", port, *more), Request)
+        except (OSError, OverflowError, TypeError) as error:
             raise UserError(f"--view {port}: this port cannot be had ({error}); give another") from None
         self.fresh, self.history = threading.Event(), deque(maxlen=task.HORIZON)
         for work in (self.draw, lambda: self.serve_forever(0.1)):
@@ -106,7 +103,7 @@ class Page(ThreadingHTTPServer):
         if hasattr(self.arm.arm, "join"):
             self.arm.arm.join(word, way)
 
-    def handle_error(self, request, address):
+    def handle_error(self, *connection):
         """A tab that was closed is no matter."""
 
 
@@ -118,12 +115,12 @@ class Request(BaseHTTPRequestHandler):
         return self.headers.get("Host") in [f"{name}:{self.server.server_port}" for name in ("127.0.0.1", "localhost")]
 
     def do_GET(self):
-        if not self.own() or self.path not in ("/", "/frame"):
-            return self.answer(404)
-        if self.path == "/frame":
-            return self.answer(200, self.server.jpeg, "image/jpeg")
         join = self.server.arm is None or hasattr(self.server.arm.arm, "join")
-        self.answer(200, HTML.replace("JOIN", "" if join else "hidden").encode(), "text/html")
+        parts = {"/": (HTML.replace("JOIN", "" if join else "hidden").encode(), "text/html"),
+                 "/frame": (self.server.jpeg, "image/jpeg")}
+        if not self.own() or self.path not in parts:
+            return self.answer(404)
+        self.answer(200, *parts[self.path])
 
     def do_POST(self):
         if not self.own() or self.headers.get("Origin") != f"http://{self.headers['Host']}":
