@@ -1,5 +1,7 @@
 """A page on this machine: what the robot sees, believes and does, and a stop button; one can join in with the simulated arm."""
+import contextlib
 import json
+import os
 import threading
 from collections import deque
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -82,6 +84,8 @@ class Page(ThreadingHTTPServer):
         self.fresh.set()
 
     def draw(self):
+        with contextlib.suppress(OSError):  # a thread has a priority of its own on Linux only
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
         while self.fresh.wait():
             self.fresh.clear()
             image = views.composite(*self.latest, list(self.history))
