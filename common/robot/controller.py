@@ -37,11 +37,13 @@ class Controller:
 
     def __exit__(self, kind, error, trace):
         self.running = False
-        if error:
-            return self.arm.fail(error)
-        if self.thread:
-            self.thread.join(2 * SILENCE)
-            self.arm.require(not self.thread.is_alive(), "the control thread hangs")
+        try:
+            if error:
+                return self.arm.fail(error)
+        finally:
+            if self.thread:
+                self.thread.join(2 * SILENCE)
+        self.arm.require(not (self.thread and self.thread.is_alive()), "the control thread hangs")
         self.arm.command(np.zeros(len(self.arm.model.limits)))
 
     def aim(self, velocity):

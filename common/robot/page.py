@@ -64,13 +64,18 @@ class Page(ThreadingHTTPServer):
             super().__init__(("127.0.0.1", port, *more), Request)
         except (OSError, OverflowError, TypeError) as error:
             raise UserError(f"--view {port}: this port cannot be had ({error}); give another") from None
-        self.fresh, self.history = threading.Event(), deque(maxlen=task.HORIZON)
-        for work in (self.draw, lambda: self.serve_forever(0.1)):
-            threading.Thread(target=work, daemon=True).start()
+        self.fresh, self.history, self.drawing = threading.Event(), deque(maxlen=task.HORIZON), True
+        self.threads = [threading.Thread(target=work, daemon=True) for work in (self.draw, lambda: self.serve_forever(0.1))]
+        for thread in self.threads:
+            thread.start()
 
     def __exit__(self, *error):
+        self.drawing = False
+        self.fresh.set()
         self.shutdown()
         self.server_close()
+        for thread in self.threads:  # a thread in OpenCV would abort the interpreter's end
+            thread.join(5)
 
     def begin(self, title):
         """A run begins."""
@@ -86,7 +91,7 @@ class Page(ThreadingHTTPServer):
     def draw(self):
         with contextlib.suppress(OSError):  # a thread has a priority of its own on Linux only
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
-        while self.fresh.wait():
+        while self.fresh.wait() and self.drawing:
             self.fresh.clear()
             image = views.composite(*self.latest, list(self.history))
             self.jpeg = cv2.imencode(".jpg", image[..., ::-1])[1].tobytes()
