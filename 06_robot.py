@@ -1,14 +1,15 @@
 """Stage 06: the policy on an arm with a camera, under natural and human-induced occlusions (sec. 6).
 
     python 06_robot.py [pretrained|smoke|quick|laptop|paper] [--weights DIR] [--scenario natural|hand_5s|hand_full|all]
-        [--runs n] [--video] [--seed k] [--realtime] [--arm module:Class] [--camera source] [--print-tags]
+        [--runs n] [--video] [--seed k] [--realtime] [--view [port]] [--think s] [--arm module:Class] [--camera source]
+        [--print-tags]
 
 Reads est_uncertainty (04) and the estimator ours (03), of the same preset or in the folder --weights. Writes to
 runs/<preset>/06_robot/seed<k>/: summary.json, robot.png, a log <scenario>_<run>.npz a run and, with --video, two mp4 a run:
 the three views, and the camera alone. A rerun goes on with the next run. --print-tags only writes <out>/tags.pdf.
 """
+import contextlib
 import importlib
-import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,15 +19,15 @@ import cv2
 import numpy as np
 import torch
 
-from common import belief, command, networks, observation, plots, runs, speed, statistics, symmetry, tables, task, weights
+from common import belief, command, networks, observation, plots, ranks, runs, speed, statistics, symmetry, tables
+from common import task, weights
 from common.env import PushVectorEnv
 from common.files import UserError, save_json, write_atomic
 from common.progress import bar
-from common.robot import hardware, iiwa, ik, runlog, safety, scene, tags, views
+from common.robot import controller, hardware, page, runlog, safety, scene, tags, views
 from common.task import World
 
 SCENARIOS = ("natural", "hand_5s", "hand_full")
-STEPS = ik.QP_RATE // task.RATE  # QP steps a tick
 PATIENCE = 5 * task.RATE  # ticks to wait for the first sight
 CERTAIN = 5  # ticks that the estimate must stay in the tolerance, where nobody knows the truth
 
@@ -37,11 +38,13 @@ class Config(hardware.Gaps, command.Reader):
     runs: int = 20  # runs of each scenario (the paper: 20, 10, 10)
     passes: int = 50  # M, stochastic passes of the estimator (sec. 4)
     video: bool = False  # write the views and the camera's images of every run as mp4
-    realtime: bool = False  # let the simulated arm move as fast as a real one, not as fast as it can
+    realtime: bool = False  # let the simulated arm move in real time and in a thread of its own, as a real one does
+    think: float = command.setting(0.03, before=0.0)  # s that the simulated clock runs on while the program thinks; below 1/15
     arm: str = "simulated"  # module:Class of a real one, with the methods of hardware.Arm; it is given this config
     camera: str = ""  # device number, file or address of a camera that OpenCV opens, instead of the arm's own
+    view: tuple[int, ...] | None = None  # show the runs at http://127.0.0.1:8006, or another port; to join in, with --realtime
     print_tags: bool = False  # write the sheet of tags for the box, and nothing else
-    free: ClassVar = (*command.Reader.free, "scenario", "runs", "video", "realtime", "print_tags")
+    free: ClassVar = (*command.Reader.free, "scenario", "runs", "video", "realtime", "view", "print_tags")
 
 
 PRESETS = {
@@ -54,18 +57,16 @@ PRESETS = {
 
 
 def connect(cfg):
-    """The arm behind its guard; UserError where there is no such class or camera, or a gap is below zero."""
-    for name in vars(hardware.Gaps()):
-        if not 0 <= getattr(cfg, name) < np.inf:
-            raise UserError(f"--{name.replace('_', '-')} {getattr(cfg, name)}: at least 0, and finite")
+    """The arm behind its guard; UserError where there is no such class, or a setting is not within its limits."""
+    for name, most in (*((name, np.inf) for name in vars(hardware.Gaps())), ("think", 1 / task.RATE)):
+        if not 0 <= getattr(cfg, name) < most:
+            raise UserError(f"--{name} {getattr(cfg, name)}: at least 0, and {'finite' if most == np.inf else 'below 1/15 s'}")
     module, _, name = cfg.arm.partition(":")
     try:  # whatever goes wrong in somebody's class
-        arm = (hardware.SimulatedArm if cfg.arm == "simulated" else getattr(importlib.import_module(module), name))(cfg)
+        make = hardware.SimulatedArm if cfg.arm == "simulated" else getattr(importlib.import_module(module), name)
+        return safety.Guarded(make(cfg))
     except Exception as error:
         raise UserError(f"--arm {cfg.arm}: {type(error).__name__}: {error}; say simulated, or module:Class") from None
-    clock = (lambda: arm.time) if isinstance(arm, hardware.SimulatedArm) else time.monotonic
-    camera = hardware.VideoCamera(cfg.camera, clock, cfg.latency / task.RATE) if cfg.camera else arm
-    return safety.Guarded(arm, camera.grab)
 
 
 def prepare(arm, cfg, scenario, k, world=World()):
@@ -84,16 +85,17 @@ def prepare(arm, cfg, scenario, k, world=World()):
     while True:  # a start of the study from which the camera sees the box
         env.reset(seed=int(rng.integers(2**31)))
         arm.place(rng, env.box[0], env.pusher[0], env.dynamics, hand)
-        if tags.Tracker().update(arm.grab()[1], scene.wrist_camera(arm.points, arm.rotation)).seen is not None:
+        if tags.Tracker().update(arm.grab()[1], scene.wrist_camera(arm.model, arm.joints)).seen is not None:
             return hand
 
 
 def sense(arm, tracker):
     """grab -> track. The first columns of a tick's row: see runlog.log_of."""
-    (taken, image), (now, q) = arm.grab(), arm.read_joints()
-    _, points, rotation = iiwa.chain(q)
-    sight = tracker.update(image, scene.wrist_camera(*iiwa.chain(arm.joints_then(taken))[1:]))
-    return dict(time=now, joints=q, pusher=points[7, :2], force=(rotation @ arm.force)[:2], image=image, **vars(sight))
+    (taken, image), (now, q) = arm.grab(), arm.joints
+    _, points, rotation = arm.model.chain(q)
+    sight = tracker.update(image, scene.wrist_camera(arm.model, arm.joints_then(taken)))
+    return dict(time=now, joints=q, points=points, pusher=points[-1, :2], force=(rotation @ arm.force)[:2], image=image,
+                **vars(sight))
 
 
 def think(f, pi, passes, row, memory):
@@ -110,68 +112,64 @@ def think(f, pi, passes, row, memory):
     return symmetry.mirror(s_hat, sign)[0], action[0], (sign, hidden, recall)
 
 
-def drive(arm, velocity, wait):
-    """QP -> command: moves the pusher with (2,) m/s for one tick; returns how many of its programs were not solved."""
-    unsolved, q = 0, arm.read_joints()[1]
-    for _ in range(STEPS):
-        speeds = ik.solve(q, velocity)
-        unsolved += speeds is None
-        arm.command(speeds)
-        wait()
-        _, q = arm.read_joints()
-        arm.read_wrench()
-    return unsolved
+def control(drive, f, pi, cfg, hand, rows, screen):
+    """One run: grab -> track -> believe -> act -> aim, 15 times a second. Returns how it ended.
 
-
-def control(arm, f, pi, cfg, hand, rows):
-    """One run: grab -> track -> believe -> act -> QP -> command, 15 times a second. Returns how it ended.
-
-    `hand` (from, to) in s is for who covers the tags of a real arm; `rows` is a list that gets a dict a tick.
+    `drive` is a controller.Controller, `hand` (from, to) in s for who covers the tags of a real arm; `rows` is a list that gets
+    a dict a tick, which the page.Page `screen` shows, if there is one.
     """
-    simulated = isinstance(arm.arm, hardware.SimulatedArm)
+    arm, simulated = drive.arm, isinstance(drive.arm.arm, hardware.SimulatedArm)
     cues = {int(moment * task.RATE): f"now {word} the tags" for moment, word in zip(hand, ("cover", "uncover")) if moment < 60}
-    wait, tracker, memory, certain = hardware.pacer(cfg.realtime or not simulated), tags.Tracker(), None, 0
-    arm.read_joints(), arm.read_wrench()
+    tracker, memory, certain = tags.Tracker(), None, 0
     for _ in range(PATIENCE):
-        drive(arm, np.zeros(2), wait)
-        if sense(arm, tracker)["seen"] is not None:
+        drive.aim(np.zeros(2))
+        drive.tick()
+        if (row := sense(arm, tracker))["seen"] is not None:
             break
     else:
         return f"box not seen for {PATIENCE // task.RATE} s"
 
     for tick in range(task.HORIZON):
-        began, slept = time.perf_counter(), wait.slept
-        row = sense(arm, tracker)
+        began = time.perf_counter()
+        row = sense(arm, tracker) if tick else row
+        row |= dict(true=arm.arm.box.copy() if simulated else np.full(3, np.nan), covered=simulated and arm.arm.covered)
         s_hat, action, memory = think(f, pi, cfg.passes, row, memory)
         arm.require(np.isfinite(s_hat).all(), "the estimate is not finite")
-        row |= dict(estimated=task.unscale_pose(s_hat[:4]), sigma=s_hat[8:], action=action,
-                    true=arm.arm.box.copy() if simulated else np.full(3, np.nan), covered=simulated and arm.arm.covered)
+        drive.aim(task.SPEEDS[action])
+        row |= dict(estimated=task.unscale_pose(s_hat[:4]), sigma=s_hat[8:], action=action)
         if not simulated and tick in cues:
             print(cues[tick])
-        row["unsolved"] = drive(arm, task.SPEEDS[action], wait)
-        row["busy"] = time.perf_counter() - began - (wait.slept - slept)
+        waited = drive.tick()
+        row |= dict(unsolved=drive.unsolved, busy=time.perf_counter() - began - waited)
         rows.append(row)
-        box, pusher = arm.arm.box if simulated else row["estimated"], iiwa.chain(arm.read_joints()[1])[1][7, :2]
+        if screen:
+            screen.show(row, tick)
+        box, pusher = arm.arm.box if simulated else row["estimated"], arm.model.chain(arm.joints[1])[1][-1, :2]
         certain = certain + 1 if task.reached(box) else 0
         if certain >= (1 if simulated else CERTAIN):
             return "success" if simulated else "success by estimate"
+        if simulated and arm.arm.ended:
+            return "ended on the page"
         if task.outside(box, pusher):
             return "out of the workspace"
     return "out of time"
 
 
-def perform(arm, f, pi, run, logs, scenario, k):
+def perform(arm, f, pi, run, logs, scenario, k, screen):
     """Run k of a scenario, its film and figure, and last its log, by which a rerun knows it; Stop where the arm was stopped."""
     rows, stop, name = [], None, f"{scenario}_{k:03d}"
     hand = prepare(arm.arm, run.cfg, scenario, k, run.world)
+    threaded = run.cfg.realtime or not isinstance(arm.arm, hardware.SimulatedArm)
+    if screen:
+        screen.begin(f"{scenario}, run {k + 1}")
     try:
-        with arm:
-            ended = control(arm, f, pi, run.cfg, hand, rows)
+        with controller.Controller(arm, threaded, run.cfg.think) as drive:
+            ended = control(drive, f, pi, run.cfg, hand, rows, screen)
     except safety.Stop as reason:
         if isinstance(arm.arm, hardware.SimulatedArm) and isinstance(reason.__context__, KeyboardInterrupt):
             raise  # not the policy's failure: the same command plays the run again
         ended, stop = "stopped", reason
-    log = runlog.log_of(rows, ended)
+    log = runlog.log_of(rows, ended, getattr(arm.arm, "joined", False))
     if rows and run.cfg.video:
         views.write(rows, run.dir / f"{name}.mp4", run.dir / f"{name}_camera.mp4")
     others = [runlog.worth(other) for done in logs.values() for other in done.values() if "age" in other]
@@ -187,7 +185,35 @@ def perform(arm, f, pi, run, logs, scenario, k):
     return f"{name} {ended} after {len(rows) / task.RATE:.1f} s"
 
 
+def play(cfg, arm, f, pi, paths, scenarios, screen):
+    """The runs that are still to do of the scenarios, and their summary."""
+    try:
+        run = runs.Run(cfg, "06_robot", paths)
+    except UserError as mistake:
+        raise UserError(f"{mistake}, or another --seed") from None
+    logs = {scenario: runlog.read(run.dir, scenario) for scenario in SCENARIOS}
+    todo = [(scenario, k) for scenario in scenarios for k in range(cfg.runs) if k not in logs[scenario]]
+    if cfg.video and len(todo) < len(scenarios) * cfg.runs:
+        print(f"--video: does nothing for {len(scenarios) * cfg.runs - len(todo)} finished runs, whose images are gone")
+    if run.finished and not todo:
+        print(f"{tables.robot(statistics.robot_runs(logs))}\n")
+        return run.skip()
+    progress = bar(len(todo), "06_robot", unit="run")
+    for scenario, k in todo:
+        progress.set_postfix_str(perform(arm, f, pi, run, logs, scenario, k, screen), refresh=False)
+        progress.update()
+        if run.out_of_time():
+            return run.stop()
+    progress.close()
+    summary = statistics.robot_runs(logs)
+    save_json(run.dir / "summary.json", summary)  # a kill may have come between the last log and its summary
+    print(f"\n{tables.robot(summary)}\n\nfigure, logs and summary.json: {run.dir}")
+    run.finish(["summary.json"])
+
+
 def main(cfg):
+    if ranks.COUNT > 1:
+        raise UserError("one arm, one process: run it as python 06_robot.py, without torchrun")
     if cfg.print_tags:
         tags.print_sheet(cfg.out / "tags.pdf")
         return print(f"{cfg.out / 'tags.pdf'}: print it at 100 %, and measure the ruler")
@@ -203,28 +229,16 @@ def main(cfg):
     if cfg.force and any(runlog.read(folder, other) for other in SCENARIOS if other not in scenarios):
         raise UserError(f"--force redoes all scenarios of {folder}: say --scenario all, or another --seed")
     runs.claim(folder)  # before anything touches an arm that another process may drive
-    arm = connect(cfg)
-    run = runs.Run(cfg, "06_robot", paths)
-    logs = {scenario: runlog.read(run.dir, scenario) for scenario in SCENARIOS}
-    todo = [(scenario, k) for scenario in scenarios for k in range(cfg.runs) if k not in logs[scenario]]
-    if run.finished and not todo:
-        print(f"{tables.robot(statistics.robot_runs(logs))}\n")
-        return run.skip()
-    progress = bar(len(todo), "06_robot", unit="run")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # which stops the arm as Ctrl-C does
-    try:
-        for scenario, k in todo:
-            progress.set_postfix_str(perform(arm, f, pi, run, logs, scenario, k), refresh=False)
-            progress.update()
-            if run.out_of_time():
-                return run.stop()
-    finally:
-        arm.stop()
-    progress.close()
-    summary = statistics.robot_runs(logs)
-    save_json(run.dir / "summary.json", summary)  # a kill may have come between the last log and its summary
-    print(f"\n{tables.robot(summary)}\n\nfigure, logs and summary.json: {run.dir}")
-    run.finish(["summary.json"])
+    # the first pass takes ten times as long as any other
+    think(f, pi, cfg.passes, dict(seen=np.zeros(3), pusher=np.zeros(2), force=np.zeros(2), age=0), None)
+    with contextlib.nullcontext() if cfg.view is None else page.Page(*cfg.view) as screen, connect(cfg) as arm:
+        if screen:
+            screen.arm = arm
+            print(f"see http://127.0.0.1:{screen.server_port}")
+        if cfg.camera:
+            clock = (lambda: arm.arm.time) if isinstance(arm.arm, hardware.SimulatedArm) else time.monotonic
+            arm.camera = hardware.VideoCamera(cfg.camera, clock, cfg.latency / task.RATE)
+        play(cfg, arm, f, pi, paths, scenarios, screen)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
 """Rotations of the plane; distance between the pusher and the box, and the face that it touches, from Coal."""
+import threading
 from functools import cache
 
 import coal
@@ -9,6 +10,7 @@ from common.task import RADIUS, World
 _ball = coal.Sphere(RADIUS)
 _at_box, _at_ball = coal.Transform3s(), coal.Transform3s()
 _request, _result = coal.DistanceRequest(), coal.DistanceResult()
+_lock = threading.Lock()  # of these, which are everybody's
 
 
 def rotation(angle):
@@ -30,10 +32,11 @@ def nearest(box, pusher, size=World.box):
     The distance is negative in penetration; the point is in the box frame, in m.
     """
     in_box_frame = (rotation(-box[2]) * np.subtract(pusher[:2], box[:2])).sum(1)  # BLAS's product rounds as the machine likes
-    _at_ball.setTranslation(np.array([*in_box_frame, 0.0]))
-    _result.clear()
-    distance = _distance(*size)[1](_at_box, _at_ball, _request, _result)
-    return distance, _result.getNearestPoint1()[:2]
+    with _lock:
+        _at_ball.setTranslation(np.array([*in_box_frame, 0.0]))
+        _result.clear()
+        distance = _distance(*size)[1](_at_box, _at_ball, _request, _result)
+        return distance, _result.getNearestPoint1()[:2]
 
 
 def face(point, last, size=World.box):

@@ -77,19 +77,30 @@ def summarise(done):
     return results
 
 
+def counts(log):
+    """Whether a robot's run tells of the policy: it began, and nobody joined in."""
+    return not str(log["ended"]).startswith("box not seen") and not log.get("joined", False)
+
+
 def robot_runs(logs):
-    """summary.json from {scenario: {run: log}}: successes with their interval, occlusion, times of the ticks, stops."""
+    """summary.json from {scenario: {run: log}}: successes with their interval, occlusion, times of the ticks, stops.
+
+    What does not count is in `not_begun` and `joined` alone.
+    """
     summary = {}
-    for scenario, runs in logs.items():
-        if runs:
-            ended = [str(log["ended"]) for log in runs.values()]
+    for scenario, every in logs.items():
+        if every:
+            runs = [log for log in every.values() if counts(log)]
+            ended = [str(log["ended"]) for log in runs]
             won = [end.startswith("success") for end in ended]
-            rate = wilson(won)
-            age, busy = (np.concatenate([log.get(key, []) for log in runs.values()]) for key in ("age", "busy"))
+            rate = wilson(won) if won else {"low": None, "high": None}
+            age, busy = (np.concatenate([[], *(log.get(key, []) for log in runs)]) for key in ("age", "busy"))
             p50, p99 = (1e3 * np.percentile(busy, (50, 99))).tolist() if busy.size else (None, None)
+            joined = sum(bool(log.get("joined", False)) for log in every.values())
             summary[scenario] = {
                 "successes": sum(won), "runs": len(won), "low": rate["low"], "high": rate["high"],
                 "by_estimate": any("estimate" in end for end in ended),
                 "occluded_share": float((age > 0).mean()) if busy.size else None, "tick_p50_ms": p50, "tick_p99_ms": p99,
-                "missed": int((busy > 1 / task.RATE).sum()), "stops": ended.count("stopped")}
+                "missed": int((busy > 1 / task.RATE).sum()), "stops": ended.count("stopped"),
+                "joined": joined, "not_begun": len(every) - len(runs) - joined}
     return summary

@@ -129,9 +129,11 @@ def robot(summary):
     rows = []
     for scenario, r in summary.items():
         success = f"{r['successes']}/{r['runs']}{' by estimate' * r['by_estimate']}"
-        interval, ticks = f"[{100 * r['low']:.0f}, {100 * r['high']:.0f}] %", ["", ""]
+        interval, ticks = "" if r["low"] is None else f"[{100 * r['low']:.0f}, {100 * r['high']:.0f}] %", ["", ""]
         if r["tick_p50_ms"] is not None:
             ticks = [f"{r['occluded_share']:.0%}", f"{r['tick_p50_ms']:.1f} / {r['tick_p99_ms']:.1f}"]
-        rows.append([scenario, success, interval, paper.ROBOT[scenario], *ticks, str(r["missed"]), str(r["stops"])])
-    header = ["scenario", "success", "95 %", "paper", "occluded frames", "tick p50 / p99 (ms)", "missed deadlines", "stops"]
+        others = ", ".join(f"{r[key]} {key.replace('_', ' ')}" for key in ("not_begun", "joined") if r[key])
+        rows.append([scenario, success, interval, paper.ROBOT[scenario], *ticks, str(r["missed"]), str(r["stops"]), others])
+    header = ["scenario", "success", "95 %", "paper", "occluded frames", "tick p50 / p99 (ms)", "missed deadlines", "stops",
+              "not counted"]
     return aligned(header, rows)

@@ -25,7 +25,7 @@ robot = importlib.import_module("06_robot")
 
 def main(cfg):
     folder = runs.run_folder(cfg.own, "06_robot", None, cfg.seed)
-    logs = runlog.read(folder, "natural")
+    logs = {k: log for k, log in runlog.read(folder, "natural").items() if statistics.counts(log)}
     if not logs:
         raise UserError(f"{folder}: no natural runs; run python 06_robot.py {cfg.preset} --scenario natural first")
     settings = runs.record_of(cfg, folder)["settings"]
@@ -36,7 +36,7 @@ def main(cfg):
     for k in bar(logs, "starts", unit="run"):
         robot.prepare(arm, cfg, "natural", k, world)
         dynamics = {name: value[0] for name, value in arm.worlds.dynamics.items()}
-        starts.append({"box": arm.box.copy(), "pusher": arm.points[7, :2]} | dynamics)
+        starts.append({"box": arm.box.copy(), "pusher": arm.points[-1, :2]} | dynamics)
     starts = {key: np.array([start[key] for start in starts]) for key in starts[0]}
     share = statistics.robot_runs({"natural": logs})["natural"]["occluded_share"]
     seconds = share / (1 - share) / world.occlusion_start / task.RATE

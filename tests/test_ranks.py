@@ -170,6 +170,7 @@ def test_killed_all_or_one_they_go_on_and_end_bit_for_bit_as_uninterrupted(tmp_p
 @pytest.mark.parametrize("words, told", [
     (["01_train_privileged", "--num-envs", 1], "2 processes share 1 worlds"),
     (["03_train_estimator"], "train_states.npy is missing"),
+    (["06_robot"], "one arm, one process"),
 ])
 def test_bad_use_is_one_line_from_rank_0(tmp_path, words, told):
     script, *words = words

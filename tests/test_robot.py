@@ -1,18 +1,28 @@
 """The parts of stage 06: kinematics, QP, tags, camera, the simulated arm."""
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 import qpsolvers
+from six_joints import SIX
 
 from common import simulator, task
-from common.robot import hardware, iiwa, ik, scene, tags
+from common.robot import hardware, ik, scene, tags
+from common.robot.iiwa import IIWA
 
 STILL = hardware.Gaps(latency=0, hand_eye_mm=0, hand_eye_deg=0, servo_lag=0, tool_mass=0, force_bias=0, force_noise=0)
 DYNAMICS = {"mass": 3.2, "mu_static": 0.4, "mu_dynamic": 0.2, "mu_pusher": 0.2, "restitution": 0.3, "limit_surface_c": 0.06}
 
 
-def placed(gaps=STILL, box=(0.0, 0.0, 0.0), pusher=(-0.1, 0.0), hand=(np.inf, np.inf), seed=0):
+@pytest.fixture(params=[IIWA, SIX], ids=["iiwa", "six joints"])
+def model(request):
+    return request.param
+
+
+def placed(gaps=STILL, box=(0.0, 0.0, 0.0), pusher=(-0.1, 0.0), hand=(np.inf, np.inf), seed=0, model=IIWA):
     arm = hardware.SimulatedArm(gaps)
+    arm.model = model
     dynamics = {name: np.array([value]) for name, value in DYNAMICS.items()}
     arm.place(np.random.default_rng(seed), np.array(box, float), np.array(pusher, float), dynamics, hand)
     return arm
@@ -31,117 +41,116 @@ def test_the_flange_is_where_the_urdf_says():
     joints = [((0, 0, 0.1575), (0, 0, 0)), ((0, 0, 0.2025), (h, 0, 2 * h)), ((0, 0.2045, 0), (h, 0, 2 * h)),
               ((0, 0, 0.2155), (h, 0, 0)), ((0, 0.1845, 0), (-h, 2 * h, 0)), ((0, 0, 0.2155), (h, 0, 0)),
               ((0, 0.081, 0), (-h, 2 * h, 0))]
-    for q in np.random.default_rng(0).uniform(-1, 1, (20, 7)) * iiwa.LIMITS:
-        turn, point = iiwa.FACING, iiwa.BASE
+    for q in np.random.default_rng(0).uniform(-1, 1, (20, 7)) * IIWA.limits:
+        turn, point = IIWA.facing, IIWA.base
         for (xyz, angles), angle in zip(joints, q):
             point, turn = point + turn @ xyz, turn @ rpy(*angles) @ rpy(0, 0, angle)
-        _, points, rotation = iiwa.chain(q)
+        _, points, rotation = IIWA.chain(q)
         assert np.allclose(rotation, turn, atol=1e-12)
-        assert np.allclose(points[7], point + (0.045 + iiwa.TOOL) * turn[:, 2], atol=1e-12)
+        assert np.allclose(points[-1], point + (0.045 + 0.25) * turn[:, 2], atol=1e-12)
 
 
-def test_the_jacobian_is_the_derivative():
-    for q in np.random.default_rng(1).uniform(-1, 1, (20, 7)) * iiwa.LIMITS:
-        j, d = iiwa.jacobian(*iiwa.chain(q)[:2]), 1e-6
-        for i in range(7):
-            (_, a, ra), (_, b, rb) = (iiwa.chain(q + side * d * np.eye(7)[i]) for side in (-1, 1))
-            assert np.allclose(j[:3, i], (b - a)[7] / (2 * d), atol=1e-8)
+def test_the_jacobian_is_the_derivative(model):
+    n = len(model.limits)
+    for q in np.random.default_rng(1).uniform(-1, 1, (20, n)) * model.limits:
+        j, d = model.jacobian(*model.chain(q)[:2]), 1e-6
+        for i in range(n):
+            (_, a, ra), (_, b, rb) = (model.chain(q + side * d * np.eye(n)[i]) for side in (-1, 1))
+            assert np.allclose(j[:3, i], (b - a)[-1] / (2 * d), atol=1e-8)
             turn = (rb @ ra.T - ra @ rb.T) / (4 * d)  # the cross product with the angular velocity
             assert np.allclose(j[3:, i], turn[[2, 0, 1], [1, 2, 0]], atol=1e-8)
 
 
-def test_the_whole_workspace_is_within_reach_ten_degrees_from_any_joint_limit():
+def test_the_whole_workspace_is_within_reach_ten_degrees_from_any_joint_limit(model):
     for x in np.linspace(-1, 1, 7):
         for y in np.linspace(-1, 1, 5):
-            q = iiwa.joints_at([x, y] * (task.HALF + ik.MARGIN))
-            _, points, rotation = iiwa.chain(q)
-            assert np.allclose(points[7], [*([x, y] * (task.HALF + ik.MARGIN)), iiwa.HEIGHT], atol=1e-8)
-            assert np.allclose(rotation, iiwa.DOWN, atol=1e-7) and (np.abs(q) < iiwa.LIMITS - np.deg2rad(10)).all()
+            q = model.joints_at([x, y] * (task.HALF + ik.MARGIN))
+            _, points, rotation = model.chain(q)
+            assert np.allclose(points[-1], [*([x, y] * (task.HALF + ik.MARGIN)), model.height], atol=1e-8)
+            assert np.allclose(rotation, model.down, atol=1e-7) and (np.abs(q) < model.limits - np.deg2rad(10)).all()
     with pytest.raises(ValueError):
-        iiwa.joints_at([0.0, 2.0])
+        model.joints_at([0.0, 2.0])
 
 
 # The quadratic program
 
 
-def test_the_program_holds_what_it_says():
-    q, v = iiwa.joints_at([0.1, -0.05]), np.array([0.03, -0.02])
-    problem, j = ik.build(q, v), iiwa.jacobian(*iiwa.chain(q)[:2])
+def test_the_program_holds_what_it_says(model):
+    q, v, n = model.joints_at([0.1, -0.05]), np.array([0.03, -0.02]), len(model.limits)
+    problem, j = ik.build(model, q, v), model.jacobian(*model.chain(q)[:2])
     p, g = problem.P.toarray(), problem.G.toarray()
     assert np.allclose(p, p.T) and np.linalg.eigvalsh(p).min() > 0.01
     assert np.allclose(problem.A.toarray(), j[2:5]) and np.allclose(problem.b, 0, atol=1e-7)
-    assert np.allclose(g[:7], np.eye(7)) and np.allclose(g[14:16], j[:2]) and np.isfinite(problem.h).all()
-    assert np.allclose(j[:2] @ ik.solve(q, v), v, atol=2e-5)
+    assert np.allclose(g[:n], np.eye(n)) and np.allclose(g[2 * n:2 * n + 2], j[:2]) and np.isfinite(problem.h).all()
+    assert np.allclose(j[:2] @ ik.solve(model, q, v), v, atol=2e-5)
 
 
 @pytest.mark.parametrize("speed, room", [(1.0, 170.0), (0.07, 4.0)])
-def test_no_limit_is_ever_broken(monkeypatch, speed, room):
+def test_no_limit_is_ever_broken(model, speed, room):
     """5,000 random ticks of the arm as it is, and 5,000 of a slow one, whose joints may turn by 4 degrees."""
     rng, dt, least = np.random.default_rng(0), 1 / ik.QP_RATE, np.inf
-    speeds, limits = speed * iiwa.SPEEDS, iiwa.LIMITS
-    monkeypatch.setattr(iiwa, "SPEEDS", speeds)
     for _ in range(50):
-        q = iiwa.joints_at(rng.uniform(-1, 1, 2) * task.HALF)
-        q = q + rng.uniform(-0.02, 0.02) * np.linalg.svd(iiwa.jacobian(*iiwa.chain(q)[:2]))[2][6]  # turns the elbow only
-        top = np.minimum(limits, np.abs(q) + np.deg2rad(room))
-        monkeypatch.setattr(iiwa, "LIMITS", top)
+        q = model.joints_at(rng.uniform(-1, 1, 2) * task.HALF)
+        free = np.linalg.svd(model.jacobian(*model.chain(q)[:2]))[2][6:]  # turns the elbow only, where there is one to spare
+        q = q + rng.uniform(-0.02, 0.02, len(free)) @ free
+        slow = replace(model, speeds=speed * model.speeds, limits=np.minimum(model.limits, np.abs(q) + np.deg2rad(room)))
         for tick in range(100):
             if tick % 50 == 0:
                 velocity = rng.uniform(-1, 1, 2) * task.MAX_SPEED
-            qd = ik.solve(q, velocity)
-            qd = np.zeros(7) if qd is None else qd
-            assert (np.abs(qd) <= speeds + 1e-6).all()
-            q, least = q + dt * qd, min(least, (speeds - np.abs(qd)).min())
-            assert (np.abs(q) <= top).all()
-            assert (np.abs(iiwa.chain(q)[1][7, :2]) <= task.HALF + ik.MARGIN + 1e-5).all()
-        monkeypatch.setattr(iiwa, "LIMITS", limits)
-    assert speed == 1 or least < 1e-4  # the slow arm's limits were felt
+            qd = ik.solve(slow, q, velocity)
+            qd = np.zeros(len(q)) if qd is None else qd
+            assert (np.abs(qd) <= slow.speeds + 1e-6).all()
+            q, least = q + dt * qd, min(least, (slow.speeds - np.abs(qd)).min())
+            assert (np.abs(q) <= slow.limits).all()
+            assert (np.abs(model.chain(q)[1][-1, :2]) <= task.HALF + ik.MARGIN + 1e-5).all()
+    assert speed == 1 or least < 1e-4 or model is SIX  # the slow arm's limits were felt
 
 
-def test_the_pusher_keeps_to_its_path_its_height_and_its_direction():
+def test_the_pusher_keeps_to_its_path_its_height_and_its_direction(model):
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1], [1, 1]]) * 0.98 * task.HALF
-    q, wanted, misses = iiwa.joints_at(corners[0]), corners[0].copy(), []
+    q, wanted, misses = model.joints_at(corners[0]), corners[0].copy(), []
     for a, b in zip(corners, corners[1:]):
         velocity = 0.0475 * (b - a) / np.linalg.norm(b - a)
         for _ in range(int(np.linalg.norm(b - a) / 0.0475 * ik.QP_RATE)):
-            q, wanted = q + ik.solve(q, velocity) / ik.QP_RATE, wanted + velocity / ik.QP_RATE
-            _, points, rotation = iiwa.chain(q)
-            assert abs(points[7, 2] - iiwa.HEIGHT) < 1e-4 and -rotation[2, 2] > np.cos(np.deg2rad(0.05))
-            misses.append(np.linalg.norm(points[7, :2] - wanted))
+            q, wanted = q + ik.solve(model, q, velocity) / ik.QP_RATE, wanted + velocity / ik.QP_RATE
+            _, points, rotation = model.chain(q)
+            down = -(rotation @ model.tool / np.linalg.norm(model.tool))[2]
+            assert abs(points[-1, 2] - model.height) < 1e-4 and down > np.cos(np.deg2rad(0.05))
+            misses.append(np.linalg.norm(points[-1, :2] - wanted))
     assert np.sqrt(np.mean(np.square(misses))) < 1e-3
 
 
-def test_a_pusher_at_the_margin_goes_no_further():
-    q = iiwa.joints_at([task.HALF[0] + ik.MARGIN - 1e-4, 0.0])
-    speeds = ik.solve(q, np.array([0.05, 0.0]))
-    assert abs((iiwa.jacobian(*iiwa.chain(q)[:2]) @ speeds)[0]) < 1.1e-3
+def test_a_pusher_at_the_margin_goes_no_further(model):
+    q = model.joints_at([task.HALF[0] + ik.MARGIN - 1e-4, 0.0])
+    speeds = ik.solve(model, q, np.array([0.05, 0.0]))
+    assert abs((model.jacobian(*model.chain(q)[:2]) @ speeds)[0]) < 1.1e-3
 
 
-@pytest.mark.parametrize("q, velocity", [(np.full(7, np.nan), np.zeros(2)), (iiwa.POSTURE, np.array([np.nan, 0.0]))])
+@pytest.mark.parametrize("q, velocity", [(np.full(7, np.nan), np.zeros(2)), (IIWA.posture, np.array([np.nan, 0.0]))])
 def test_what_is_not_a_number_has_no_solution(q, velocity):
-    assert ik.solve(q, velocity) is None
+    assert ik.solve(IIWA, q, velocity) is None
 
 
-def test_an_infeasible_program_has_no_solution(monkeypatch):
+def test_an_infeasible_program_has_no_solution(model):
     """Joints too slow for the correction of the height."""
-    monkeypatch.setattr(iiwa, "SPEEDS", np.full(7, 1e-4))
-    q = iiwa.joints_at([0.0, 0.0]) + [0, 0.05, 0, 0, 0, 0, 0]
-    assert not qpsolvers.solve_problem(ik.build(q, np.zeros(2)), solver="clarabel").found
-    assert ik.solve(q, np.zeros(2)) is None
+    slow = replace(model, speeds=np.full(len(model.limits), 1e-4))
+    q = model.joints_at([0.0, 0.0]) + np.eye(len(model.limits))[1] * 0.05
+    assert not qpsolvers.solve_problem(ik.build(slow, q, np.zeros(2)), solver="clarabel").found
+    assert ik.solve(slow, q, np.zeros(2)) is None
 
 
 # Tags and camera
 
 
-def test_the_camera_and_its_inverse_agree():
-    points, rotation = iiwa.chain(iiwa.joints_at([0.05, -0.02]))[1:]
-    camera = scene.wrist_camera(points, rotation, np.array([0.001, 0, 0.002, 0.01, 0.02, 0]))
+def test_the_camera_and_its_inverse_agree(model):
+    q = model.joints_at([0.05, -0.02])
+    camera = scene.wrist_camera(model, q, np.array([0.001, 0, 0.002, 0.01, 0.02, 0]))
     spots = np.random.default_rng(0).uniform(-0.1, 0.1, (50, 2))
     pixels, depth = camera.project(np.append(spots, np.full((50, 1), 0.07), 1))
     assert (depth > 0.1).all() and np.allclose(camera.on_plane(pixels, 0.07), spots, atol=1e-12)
     h = np.append(spots, np.ones((50, 1)), 1) @ camera.plane(0.07).T
     assert np.allclose(h[:, :2] / h[:, 2:], pixels)
-    assert np.allclose(scene.wrist_camera(points, rotation).project(points[7])[0], [319.5, 239.5])  # it looks at the ball
+    assert np.allclose(scene.wrist_camera(model, q).project(model.chain(q)[1][-1])[0], [319.5, 239.5])  # it looks at the ball
 
 
 def test_the_sheet_has_the_tags_where_the_fit_expects_them():
@@ -163,12 +172,13 @@ def test_the_printed_sheet_is_at_true_scale(tmp_path):
 def test_the_pose_of_the_box_is_seen_to_half_a_millimetre():
     """2,000 random poses under the camera: accurate where seen, and no flips."""
     rng, errors, images = np.random.default_rng(0), [], 2000
-    arms = [iiwa.chain(iiwa.joints_at(xy))[1:] for xy in rng.uniform(-1, 1, (50, 2)) * task.HALF]
+    arms = [IIWA.joints_at(xy) for xy in rng.uniform(-1, 1, (50, 2)) * task.HALF]
     for _ in range(images):
-        points, rotation = arms[rng.integers(len(arms))]
+        q = arms[rng.integers(len(arms))]
+        points = IIWA.chain(q)[1]
         away, angle = rng.uniform(-np.pi, np.pi), rng.uniform(-np.pi, np.pi)
-        box = np.array([*(points[7, :2] + rng.uniform(0.085, 0.12) * np.array([np.cos(away), np.sin(away)])), angle])
-        camera = scene.wrist_camera(points, rotation)
+        box = np.array([*(points[-1, :2] + rng.uniform(0.085, 0.12) * np.array([np.cos(away), np.sin(away)])), angle])
+        camera = scene.wrist_camera(IIWA, q)
         sight = tags.Tracker().update(scene.photograph(camera, box, points, False, rng), camera)
         if sight.seen is not None:
             errors.append([np.linalg.norm(sight.seen[:2] - box[:2]), abs(task.wrap(sight.seen[2] - box[2]))])
@@ -179,8 +189,8 @@ def test_the_pose_of_the_box_is_seen_to_half_a_millimetre():
 
 def test_a_covered_box_is_not_seen_and_the_last_pose_is_held():
     rng, tracker = np.random.default_rng(0), tags.Tracker()
-    points, rotation = iiwa.chain(iiwa.joints_at([-0.09, 0.0]))[1:]
-    camera, box = scene.wrist_camera(points, rotation), np.array([0.0, 0.0, 0.3])
+    points = IIWA.chain(IIWA.joints_at([-0.09, 0.0]))[1]
+    camera, box = scene.wrist_camera(IIWA, IIWA.joints_at([-0.09, 0.0])), np.array([0.0, 0.0, 0.3])
     assert tracker.update(scene.photograph(camera, box, points, True, rng), camera).seen is None
     first = tracker.update(scene.photograph(camera, box, points, False, rng), camera)
     assert first.age == 0 and np.abs(first.seen - box).max() < 1e-3
@@ -190,15 +200,14 @@ def test_a_covered_box_is_not_seen_and_the_last_pose_is_held():
 
 
 def test_a_bad_fit_is_rejected():
-    points, rotation = iiwa.chain(iiwa.joints_at([0.0, 0.0]))[1:]
-    camera, ids = scene.wrist_camera(points, rotation), np.arange(4)
+    camera, ids = scene.wrist_camera(IIWA, IIWA.joints_at([0.0, 0.0])), np.arange(4)
     pixels, _ = camera.project(np.append(tags.CORNERS[:4], np.full((4, 4, 1), 0.07), 2))
     pose, residual = tags.fit(pixels, ids, camera)
     assert np.abs(pose).max() < 1e-9 and residual < 1e-9
     assert tags.fit(pixels, ids[::-1], camera)[1] > tags.RESIDUAL
-    points[7, 2] += 0.05  # a camera higher than believed
+    higher = replace(camera, position=camera.position + [0, 0, 0.05])  # than believed
     assert tags.fit(camera.project(np.append(tags.CORNERS, np.full((12, 4, 1), 0.07), 2))[0], np.arange(12),
-                    scene.wrist_camera(points, rotation))[1] > tags.RESIDUAL
+                    higher)[1] > tags.RESIDUAL
 
 
 # The simulated arm
@@ -206,7 +215,7 @@ def test_a_bad_fit_is_rejected():
 
 def drive(arm, velocity, ticks):
     for _ in range(ticks * 10):
-        arm.command(ik.solve(arm.read_joints()[1], np.array(velocity)))
+        arm.command(ik.solve(arm.model, arm.read_joints()[1], np.array(velocity)))
         yield arm.read_wrench()[1]
 
 
@@ -214,7 +223,7 @@ def test_the_arm_pushes_the_box_as_the_training_world_does():
     """The same push at 150 steps a second and at 15, to a millimetre and a degree."""
     for offset in (-0.02, 0.0, 0.03):
         arm, worlds = placed(pusher=(-0.08, offset)), simulator.Worlds(1)
-        worlds.place(np.arange(1), np.zeros((1, 3)), np.array([[-0.08, offset]]), {k: np.array([v]) for k, v in DYNAMICS.items()})
+        worlds.place(np.arange(1), np.zeros((1, 3)), np.array([[-0.08, offset]]), arm.worlds.dynamics)
         for _ in range(30):
             list(drive(arm, (0.05, 0.0), 1))
             worlds.step(np.array([[0.05, 0.0]]))
@@ -250,17 +259,17 @@ def test_the_servo_lags():
 def test_the_camera_is_a_frame_late_and_says_so():
     arm = placed(hardware.Gaps(**vars(STILL) | {"latency": 1}))
     list(drive(arm, (0.05, 0.0), 2))
-    points = arm.points.copy()
+    points, q = arm.points.copy(), arm.joints
     list(drive(arm, (0.0, 0.05), 1))
     taken, image = arm.grab()
     assert np.isclose(taken, 2 / 15) and np.isclose(arm.time, 3 / 15)
-    expected = scene.render(scene.wrist_camera(points, iiwa.DOWN), arm.box, points)
+    expected = scene.render(scene.wrist_camera(IIWA, q), arm.box, points)
     assert np.abs(cv2.GaussianBlur(image, (0, 0), 5).astype(int) - cv2.GaussianBlur(expected, (0, 0), 5)).mean() < 1.5
 
 
 def test_hand_eye_error_shifts_what_is_seen():
     arm = placed(hardware.Gaps(**vars(STILL) | {"hand_eye_mm": 5.0}))
-    sight = tags.Tracker().update(arm.grab()[1], scene.wrist_camera(arm.points, arm.rotation))
+    sight = tags.Tracker().update(arm.grab()[1], scene.wrist_camera(arm.model, arm.joints))
     assert 1e-3 < np.linalg.norm(sight.seen[:2]) < 0.02
     assert np.allclose(sight.seen[:2], -(arm.rotation @ arm.error[:3])[:2], atol=3e-3)
 

@@ -9,19 +9,24 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from common import simulator, task
+from common import geometry, simulator, task
 from common.files import UserError
-from common.robot import iiwa, ik, scene
+from common.robot import ik, scene
+from common.robot.iiwa import IIWA
+from common.robot.model import Model
 
 
 class Arm(Protocol):
-    """The five methods that attach an arm with a force sensor and a camera; SI units, times of time.monotonic().
+    """The model and the five methods that attach an arm of n joints, a force sensor, a camera; SI units, time.monotonic().
 
-    Joints and wrench are read and `command` is called 150 times a second: readings are at most 50 ms old, no method waits.
+    Joints and wrench are read and `command` is called 150 times a second by one thread, `grab` 15 times by another, and `stop`
+    by either, never within a `command`: readings are at most 50 ms old, no method waits.
     """
 
+    model: Model
+
     def read_joints(self) -> tuple[float, np.ndarray]:
-        """Time and joint angles (7,) in rad."""
+        """Time and joint angles (n,) in rad."""
 
     def read_wrench(self) -> tuple[float, np.ndarray]:
         """Time and the force (3,) in N that the pusher feels, tool frame, weight compensated."""
@@ -30,7 +35,7 @@ class Arm(Protocol):
         """Time of exposure and the newest image (480, 640, 3) uint8 BGR, undistorted; the image is None where there is none."""
 
     def command(self, velocity: np.ndarray) -> None:
-        """Joint velocities (7,) in rad/s, held until the next call; for safety zero where that does not come within 0.1 s."""
+        """Joint velocities (n,) in rad/s, held until the next call; for safety zero where that does not come within 0.1 s."""
 
     def stop(self) -> None:
         """Zero velocity, and no other until the program has ended."""
@@ -46,11 +51,13 @@ class Gaps:
     servo_lag: float = 0.02  # time constant in s of the joints' first-order response
     tool_mass: float = 0.3  # kg beyond the force sensor, whose inertia it feels (the paper's limitation)
     force_bias: float = 0.7  # standard deviation of its bias in N, drawn once a run (tab. occlusion_and_noise_params)
-    force_noise: float = 0.7  # standard deviation of each reading of the force sensor in N (tab. occlusion_and_noise_params)
+    force_noise: float = 0.7  # standard deviation in N of a control step's mean force (tab. occlusion_and_noise_params)
 
 
 class SimulatedArm:
-    """An iiwa, its camera and its force sensor over a pymunk world; its clock runs on with each command, by 1/ik.QP_RATE s."""
+    """An arm, its camera and its force sensor over a pymunk world; its clock runs on with each command, by 1/ik.QP_RATE s."""
+
+    model = IIWA
 
     def __init__(self, gaps: Gaps):
         self.gaps, self.worlds, self.stopped = gaps, simulator.Worlds(1, sub_steps=1, rate=ik.QP_RATE), False
@@ -58,12 +65,13 @@ class SimulatedArm:
     def place(self, rng, box, pusher, dynamics, hand=(np.inf, np.inf)):
         """Starts anew: box (3,), pusher (2,), dynamics as simulator.Worlds.place takes them, from when to when a hand (s)."""
         g, self.rng, self.time, self.hand = self.gaps, rng, 0.0, hand
+        self.joined, self.ended, self.held, self.nudges = False, False, 0.0, deque(maxlen=100)
         self.worlds.place(np.arange(1), box[None], pusher[None], dynamics)
-        self.joints, self.speeds = iiwa.joints_at(pusher), np.zeros(7)
-        self.points, self.rotation = iiwa.chain(self.joints)[1:]
+        self.joints, self.speeds = self.model.joints_at(pusher), np.zeros(len(self.model.limits))
+        self.points, self.rotation = self.model.chain(self.joints)[1:]
         self.velocity = self.acceleration = np.zeros(3)  # of the ball
         self.error = rng.normal(0, [g.hand_eye_mm / 1e3] * 3 + [np.deg2rad(g.hand_eye_deg)] * 3)
-        self.bias = rng.normal(0, g.force_bias, 3)  # N
+        self.bias, self.noise = rng.normal(0, g.force_bias, 3), rng.normal(0, g.force_noise, 3)  # N
         self.past = deque(maxlen=1 + round(g.latency * ik.QP_RATE / task.RATE))
         self.remember()
 
@@ -73,35 +81,52 @@ class SimulatedArm:
 
     @property
     def covered(self):
-        return self.hand[0] <= self.time < self.hand[1]  # whether a hand is over the tags
+        return self.hand[0] <= self.time < self.hand[1] or time.monotonic() < self.held  # whether a hand is over the tags
 
     def remember(self):
-        self.past.append((self.time, self.box.copy(), self.points, self.rotation, self.covered))
+        self.past.append((self.time, self.box.copy(), self.joints, self.points, self.covered))
 
     def read_joints(self):
         return self.time, self.joints.copy()
 
     def read_wrench(self):
         felt = np.append(self.worlds.force[0], 0.0) - self.gaps.tool_mass * self.acceleration
-        return self.time, self.rotation.T @ felt + self.bias + self.rng.normal(0, self.gaps.force_noise, 3)
+        return self.time, self.rotation.T @ felt + self.bias + self.noise
 
     def grab(self):
-        time, box, points, rotation, covered = self.past[0]
-        return time, scene.photograph(scene.wrist_camera(points, rotation, self.error), box, points, covered, self.rng)
+        taken, box, joints, points, covered = self.past[0]
+        return taken, scene.photograph(scene.wrist_camera(self.model, joints, self.error), box, points, covered, self.rng)
 
     def command(self, velocity):
-        wanted, lag = np.zeros(7) if self.stopped else velocity, self.gaps.servo_lag
+        wanted, lag = np.zeros(len(self.joints)) if self.stopped else velocity, self.gaps.servo_lag
         self.speeds = wanted + (self.speeds - wanted) * (np.exp(-1 / ik.QP_RATE / lag) if lag else 0.0)
         self.joints = self.joints + self.speeds / ik.QP_RATE
-        before, self.time = self.points[7], self.time + 1 / ik.QP_RATE
-        _, self.points, self.rotation = iiwa.chain(self.joints)
-        velocity = ik.QP_RATE * (self.points[7] - before)
+        before, self.time = self.points[-1], self.time + 1 / ik.QP_RATE
+        _, self.points, self.rotation = self.model.chain(self.joints)
+        velocity = ik.QP_RATE * (self.points[-1] - before)
         self.acceleration, self.velocity = ik.QP_RATE * (velocity - self.velocity), velocity
-        self.worlds.step(ik.QP_RATE * (self.points[7:, :2] - self.worlds.pusher))
+        while self.nudges:
+            box = self.box + np.append(self.nudges.popleft(), 0.0)
+            if geometry.nearest(box, self.points[-1])[0] > 0 and not task.outside(box, self.worlds.pusher[0]):
+                self.worlds.place(np.arange(1), box[None], self.worlds.pusher, {})
+        self.worlds.step(ik.QP_RATE * (self.points[-1:, :2] - self.worlds.pusher))
+        if round(self.time * ik.QP_RATE) % (ik.QP_RATE // task.RATE) == 1:  # one draw a control step, and no mean makes it less
+            self.noise = self.rng.normal(0, self.gaps.force_noise, 3)
         self.remember()
 
     def stop(self):
-        self.stopped, self.speeds = True, np.zeros(7)
+        self.stopped, self.speeds = True, np.zeros(len(self.model.limits))
+
+
+    def join(self, what, way=()):
+        """Somebody "cover"s the tags for half a second, asks for the "next" run, or "nudge"s the box by (2,) m; any thread."""
+        self.joined = True
+        if what == "cover":
+            self.held = time.monotonic() + 0.5
+        if what == "next":
+            self.ended = True
+        if what == "nudge":
+            self.nudges.append(way)
 
 
 class VideoCamera:
@@ -129,16 +154,3 @@ class VideoCamera:
 
     def grab(self):
         return self.newest if self.live else self.read()
-
-
-def pacer(on):
-    """wait(), which sleeps until the next QP step is due, and makes up for a late one; wait.slept counts the seconds slept."""
-    def wait():
-        now = time.perf_counter()
-        wait.due = max(wait.due + 1 / ik.QP_RATE, now - 1 / task.RATE)
-        if on and wait.due > now:
-            time.sleep(wait.due - now)
-            wait.slept += wait.due - now
-
-    wait.due, wait.slept = time.perf_counter(), 0.0
-    return wait

@@ -12,7 +12,6 @@ import qpsolvers
 from scipy.sparse import csc_matrix
 
 from common import task
-from common.robot import iiwa
 
 warnings.filterwarnings("ignore", module="qpsolvers")  # what the solver says of a failure, solve returns
 
@@ -32,24 +31,24 @@ def _sparse(matrix):
     return csc_matrix((matrix.ravel("F"), indices, starts), shape=matrix.shape)
 
 
-def build(q, velocity):
-    """The program at joint angles q (7,) rad for a wanted velocity (2,) m/s of the pusher, world frame."""
-    axes, points, rotation = iiwa.chain(q)
-    j, xy, turn = iiwa.jacobian(axes, points), points[7, :2], HOLD * iiwa.turned(rotation)
-    turn, rise = np.clip(turn, -TURN, TURN), np.clip(HOLD * (iiwa.HEIGHT - points[7, 2]), -CLIMB, CLIMB)
+def build(model, q, velocity):
+    """The program of a model.Model at joint angles q (n,) rad for a wanted velocity (2,) m/s of the pusher, world frame."""
+    axes, points, rotation = model.chain(q)
+    j, xy, turn, one = model.jacobian(axes, points), points[-1, :2], HOLD * model.turned(rotation), np.eye(len(q))
+    turn, rise = np.clip(turn, -TURN, TURN), np.clip(HOLD * (model.height - points[-1, 2]), -CLIMB, CLIMB)
     free, wanted = j[[0, 1, 5]], np.append(np.clip(velocity, -task.MAX_SPEED, task.MAX_SPEED), turn[2])
-    hessian = free.T @ (WEIGHTS[:, None] * free) + (DAMPING + POSTURE_WEIGHT) * np.eye(7)
-    gradient = -free.T @ (WEIGHTS * wanted) - POSTURE_WEIGHT * POSTURE_GAIN * (iiwa.POSTURE - q)
-    upper, lower = (np.clip(HOLD * (side * (iiwa.LIMITS - LIMIT_GAP) - q), -iiwa.SPEEDS, iiwa.SPEEDS) for side in (1, -1))
+    hessian = free.T @ (WEIGHTS[:, None] * free) + (DAMPING + POSTURE_WEIGHT) * one
+    gradient = -free.T @ (WEIGHTS * wanted) - POSTURE_WEIGHT * POSTURE_GAIN * (model.posture - q)
+    upper, lower = (np.clip(HOLD * (side * (model.limits - LIMIT_GAP) - q), -model.speeds, model.speeds) for side in (1, -1))
     ahead, behind = (np.maximum(HOLD * (task.HALF + MARGIN - side * xy), -task.MAX_SPEED) for side in (1, -1))
-    bounds = np.concatenate([np.eye(7), -np.eye(7), j[:2], -j[:2]])
+    bounds = np.concatenate([one, -one, j[:2], -j[:2]])
     return qpsolvers.Problem(_sparse(hessian), gradient, _sparse(bounds), np.concatenate([upper, -lower, ahead, behind]),
                              _sparse(j[2:5]), np.append(rise, turn[:2]))
 
 
-def solve(q, velocity):
-    """Joint velocities (7,) rad/s, or None: an input is not finite, the program is infeasible, or was not solved."""
+def solve(model, q, velocity):
+    """Joint velocities (n,) rad/s, or None: an input is not finite, the program is infeasible, or was not solved."""
     if not (np.isfinite(q).all() and np.isfinite(velocity).all()):
         return None
-    solution = qpsolvers.solve_problem(build(q, velocity), solver="clarabel")
+    solution = qpsolvers.solve_problem(build(model, q, velocity), solver="clarabel")
     return solution.x if solution.found and np.isfinite(solution.x).all() else None  # x is filled even in failure

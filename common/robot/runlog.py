@@ -6,14 +6,14 @@ import numpy as np
 from common.files import UserError
 
 
-def log_of(rows, ended):
-    """A run as arrays with a row a tick, in s, rad, m, N and the workspace's frame, and how it `ended`.
+def log_of(rows, ended, joined):
+    """A run as arrays with a row a tick, in s, rad, m, N and the workspace's frame, how it `ended`, and if somebody `joined`.
 
     `seen` is the last fit of the tags, `age` how many frames ago that was, `residual` (m) of this frame's; `sigma` is of x, y,
     sin, cos as the nets have them; `covered` is the hand; `unsolved` counts programs without a solution; `busy` is computing.
     """
-    kept = [key for key in (rows[0] if rows else ()) if key not in ("corners", "image")]
-    return {"ended": np.array(ended)} | {key: np.array([row[key] for row in rows]) for key in kept}
+    kept = [key for key in (rows[0] if rows else ()) if key not in ("corners", "image", "points")]
+    return {"ended": np.array(ended), "joined": np.array(joined)} | {key: np.array([row[key] for row in rows]) for key in kept}
 
 
 def read(folder, scenario):

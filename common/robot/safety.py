@@ -1,4 +1,7 @@
 """Between the program and the arm: everything read is looked at, and the first doubt stops the arm for good."""
+import os
+import signal
+import threading
 import time as wall
 import traceback
 from collections import deque
@@ -8,7 +11,7 @@ import numpy as np
 
 from common import task
 from common.files import UserError
-from common.robot import iiwa, ik, scene
+from common.robot import ik, scene
 
 FORCE, PEAK = 40.0, 100.0  # N: of the mean over a control step, and of one reading
 SENSOR_AGE, CAMERA_AGE = 0.05, 0.5  # s, of the newest joint angles and wrench, and of the newest image
@@ -16,8 +19,12 @@ EARLY = 0.02  # s that a time may be ahead of that of the joint angles
 FROZEN = 5  # equal images in a row: a live camera's noise never repeats
 UNSOLVED = 3  # programs in a row
 JOINT_GAP = np.deg2rad(0.5)  # rad to a joint's limit; the program keeps 2 degrees
+OVERSPEED = 1.1  # times a joint's largest speed: what its readings may show
+TIP, TIP_XY = 0.1, 0.08  # m/s, of the pusher in any direction, and in the plane; the policy asks for 0.071 at most
 HEIGHT_GAP, TILT = 0.005, np.deg2rad(2.0)  # m and rad from the pusher's height and direction; the program keeps 0.1 mm
 BORDER = task.HALF + ik.MARGIN + 0.001  # m, farthest place of the pusher: the program's limit, and 1 mm
+SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM", signal.SIGQUIT: "SIGQUIT",
+           signal.SIGHUP: "SIGHUP, the terminal was closed"}
 
 
 class Stop(UserError):
@@ -27,35 +34,73 @@ class Stop(UserError):
 class Guarded:
     """An Arm whose readings are whole, new and within limits, or which has stopped for good and raised Stop.
 
-    As a context it is one run: it begins with nothing read, ends with zero velocity, and an exception inside is a Stop.
-    `arm` is a hardware.Arm; `grab` the camera's, if that is not the arm's own.
+    As a context it is the time in which the arm can move: a signal or an exception inside is a Stop, and it ends with the
+    arm's own stop. `arm` is a hardware.Arm; `camera` has grab(), and is the arm itself until it is set. Joints, wrench and
+    commands may be one thread's and images another's; `halt` is any thread's.
     """
 
-    def __init__(self, arm, grab=None):
-        self.arm, self._grab, self.stopped = arm, grab or arm.grab, ""
+    def __init__(self, arm):
+        self.arm, self.camera, self.stopped, self._lock = arm, arm, "", threading.Lock()
 
     def __enter__(self):
-        self._joints, self._forces = deque(maxlen=ik.QP_RATE), deque(maxlen=ik.QP_RATE // task.RATE)  # a second's, a tick's
-        self._renewed, self._again, self._unsolved, self._equal, self._image = wall.monotonic(), 0, 0, 0, None
+        self._handlers = {number: signal.signal(number, self._signalled) for number in SIGNALS
+                          if signal.getsignal(number) is not signal.SIG_IGN}  # as nohup has it
         return self
 
     def __exit__(self, kind, error, trace):
-        if kind is None:
-            return self.command(np.zeros(7))
-        if not issubclass(kind, Stop):
-            place = traceback.extract_tb(trace)[-1]
-            failure = f"{kind.__name__} in {Path(place.filename).name}, line {place.lineno}: {error}"
-            self.stop("Ctrl-C" if kind is KeyboardInterrupt else failure)
+        try:
+            if error:
+                self.fail(error)
+            self.halt("the program has ended")
+            if not self.stopped.startswith("arm stopped"):
+                raise Stop(self.stopped)
+        finally:
+            for number, handler in self._handlers.items():
+                signal.signal(number, handler)
+            _let_print()
 
-    def stop(self, reason=""):
-        """Stops the arm for good; a Stop if there is a reason (none at the program's end), or the arm's own stop failed."""
-        self.stopped = self.stopped or reason and f"arm stopped: {reason}"
+    def _signalled(self, number, frame):
+        """Only notes the reason, and lets the exception stop the arm: the signal may have come within a call of the driver."""
+        if not self.stopped:
+            self.stopped = f"arm stopped: {SIGNALS[number]}"
+            raise KeyboardInterrupt
+
+    @property
+    def model(self):
+        """The arm's model.Model."""
+        return self.arm.model
+
+    def begin(self):
+        """A run begins: what was read before does not count."""
+        self._joints, self._forces = deque(maxlen=ik.QP_RATE), deque(maxlen=ik.QP_RATE // task.RATE)  # a second's, a tick's
+        self._renewed, self._again, self._unsolved, self._equal, self._image = wall.monotonic(), 0, 0, 0, None
+        self.read_joints(), self.read_wrench()
+
+    def halt(self, reason):
+        """Stops the arm for good; the first reason stays. The lock orders it and commands: after it none reaches the arm."""
+        self.stopped = self.stopped or f"arm stopped: {reason}"
+        mine = self._lock.acquire(timeout=0.1)  # no longer: a driver may hang in its command
         try:
             self.arm.stop()
-        except Exception as error:
-            self.stopped = f"the arm's own stop() failed ({type(error).__name__}: {error}); {self.stopped}".rstrip("; ")
-        if self.stopped:
-            raise Stop(self.stopped)
+        except BaseException as error:
+            failure = f"the arm's own stop() failed ({type(error).__name__}: {error})"
+            self.stopped = self.stopped if failure in self.stopped else f"{failure}; {self.stopped}"
+        finally:
+            if mine:
+                self._lock.release()
+
+    def stop(self, reason):
+        """Stops the arm for good, and raises Stop."""
+        self.halt(reason)
+        raise Stop(self.stopped)
+
+    def fail(self, error):
+        """Stops the arm for an exception, and raises Stop with one line of it; not where it is a line already, a UserError."""
+        if isinstance(error, UserError):
+            return self.halt(error)
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        failure = f"{type(error).__name__} in {Path(place.filename).name}, line {place.lineno}: {error}"
+        self.stop("Ctrl-C" if isinstance(error, KeyboardInterrupt) else failure)
 
     def require(self, good, reason):
         """Stops the arm unless `good`."""
@@ -63,27 +108,39 @@ class Guarded:
             self.stop(reason)
 
     def read_joints(self):
-        """Time and joint angles (7,) in rad."""
+        """Time and joint angles (n,) in rad."""
         time, q = self.arm.read_joints()
-        self.require(np.isfinite(time) and np.shape(q) == (7,) and np.isfinite(q).all(), "joint angles: not seven numbers")
+        whole = np.shape(q) == self.model.limits.shape and np.isfinite(time) and np.isfinite(q).all()
+        self.require(whole, f"joint angles: not {len(self.model.limits)} numbers")
+        q = np.array(q, float)
+        for i in np.flatnonzero(np.abs(q) > self.model.limits - JOINT_GAP):
+            self.stop(f"joint {i + 1} is at its limit, {np.rad2deg(q[i]):.1f} degrees")
+        axes, points, rotation = self.model.chain(q)
+        self._jacobian = self.model.jacobian(axes, points)[:3]
+        x, y, rise = points[-1] - [0, 0, self.model.height]
+        tilt = np.arccos(np.clip((np.trace(rotation.T @ self.model.down) - 1) / 2, -1, 1))
+        self.require(abs(x) <= BORDER[0] and abs(y) <= BORDER[1], f"the pusher is beyond the border, at {x:.3f}, {y:.3f} m")
+        self.require(abs(rise) <= HEIGHT_GAP and tilt <= TILT,
+                     f"the pusher is {1e3 * rise:.1f} mm above its height and turned by {np.rad2deg(tilt):.1f} degrees")
+        last, before = self._joints[-1] if self._joints else (time, q)
+        within = np.clip(time - last, 1 / ik.QP_RATE, SENSOR_AGE)
+        for i in np.flatnonzero(np.abs(q - before) > OVERSPEED * self.model.speeds * within):
+            self.stop(f"joint {i + 1} is over its speed, {np.rad2deg(q - before)[i]:.1f} degrees in {within:.3f} s")
         if not self._joints or time > self._joints[-1][0]:
             self._joints.append((time, q))
             self._renewed, self._again = wall.monotonic(), 0
         self._again += 1
         self.require(self._again <= 8 or wall.monotonic() - self._renewed <= SENSOR_AGE, "joint angles: nothing new")
-        for i in np.flatnonzero(np.abs(q) > iiwa.LIMITS - JOINT_GAP):
-            self.stop(f"joint {i + 1} is at its limit, {np.rad2deg(q[i]):.1f} degrees")
-        _, points, rotation = iiwa.chain(q)
-        x, y, rise = points[7] - [0, 0, iiwa.HEIGHT]
-        tilt = np.arccos(np.clip((np.trace(rotation.T @ iiwa.DOWN) - 1) / 2, -1, 1))
-        self.require(abs(x) <= BORDER[0] and abs(y) <= BORDER[1], f"the pusher is beyond the border, at {x:.3f}, {y:.3f} m")
-        self.require(abs(rise) <= HEIGHT_GAP and tilt <= TILT,
-                     f"the pusher is {1e3 * rise:.1f} mm above its height and turned by {np.rad2deg(tilt):.1f} degrees")
         return time, q
 
+    @property
+    def joints(self):
+        """Time and joint angles (n,) in rad that were read last."""
+        return self._joints[-1]
+
     def joints_then(self, time):
-        """Joint angles (7,) at an earlier time, between those that were read."""
-        times, q = zip(*self._joints)
+        """Joint angles (n,) at an earlier time, between those that were read."""
+        times, q = zip(*tuple(self._joints))
         return np.array([np.interp(time, times, angle) for angle in zip(*q)])
 
     def _check_age(self, sensor, time, oldest):
@@ -95,7 +152,7 @@ class Guarded:
         time, force = self.arm.read_wrench()
         self.require(np.shape(force) == (3,) and np.isfinite(force).all(), "wrench: not three numbers")
         self._check_age("wrench", time, SENSOR_AGE)
-        self._forces.append(force)
+        self._forces.append(np.array(force, float))
         mean, peak = np.linalg.norm(self.force), np.linalg.norm(force)
         self.require(mean <= FORCE and peak <= PEAK, f"force of {mean:.0f} N, over {FORCE:.0f} N, or peak of {peak:.0f} N")
         return time, force
@@ -103,11 +160,11 @@ class Guarded:
     @property
     def force(self):
         """Mean force (3,) in N of the last control step's readings, tool frame."""
-        return np.mean(self._forces, 0)
+        return np.mean(tuple(self._forces), 0)
 
     def grab(self):
         """Time and image (480, 640, 3) uint8 BGR, a copy. Call it after read_joints."""
-        time, image = self._grab()
+        time, image = self.camera.grab()
         self.require(image is not None, "camera: no image")
         shape, due = np.shape(image), (*scene.SIZE[::-1], 3)
         self.require(shape == due, f"camera: images of shape {shape}, not {due} as common/robot/scene.py has it")
@@ -118,11 +175,29 @@ class Guarded:
         return time, self._image
 
     def command(self, velocity):
-        """Joint velocities (7,) in rad/s, or zero where the program was not solved (None)."""
-        if self.stopped:
-            raise Stop(self.stopped)
+        """Joint velocities (n,) in rad/s, or zero where the program was not solved (None)."""
+        self.check()
         self._unsolved = self._unsolved + 1 if velocity is None else 0
         self.require(self._unsolved < UNSOLVED, f"{UNSOLVED} programs in a row were not solved")
-        velocity = np.zeros(7) if velocity is None else velocity
-        self.require((np.abs(velocity) <= 1.001 * iiwa.SPEEDS).all(), "a joint velocity is not within its limit")
-        self.arm.command(velocity)
+        velocity = np.zeros(len(self.model.limits)) if velocity is None else velocity
+        self.require((np.abs(velocity) <= 1.001 * self.model.speeds).all(), "a joint velocity is not within its limit")
+        tip = self._jacobian @ velocity
+        speed, speed_xy = np.linalg.norm(tip), np.linalg.norm(tip[:2])
+        self.require(speed <= TIP and speed_xy <= TIP_XY, f"the pusher would move at {speed:.3f} m/s")
+        with self._lock:
+            self.check()
+            self.arm.command(velocity)
+
+    def check(self):
+        """Raises Stop where the arm has been stopped."""
+        if self.stopped:
+            raise Stop(self.stopped)
+
+
+def _let_print():
+    """Prints into nothing from now on where the terminal is gone: the exit code still tells."""
+    for descriptor in (1, 2):
+        try:
+            os.write(descriptor, b"")
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 
 from common import draw, geometry, task
-from common.robot import iiwa, tags
+from common.robot import tags
 
 NEAR = 0.03  # m, nothing nearer is drawn
 STEM = 0.008  # m, radius of the pusher's stem
@@ -56,13 +56,14 @@ _BESIDE = np.array([0.75, 0.95, 0.75])  # where figures are seen from
 OVERVIEW = Camera(780.0, SIZE, _looking(_BESIDE, np.array([0.0, -0.1, 0.2]), np.array([-1.0, 0.75, 0.0])), _BESIDE)
 
 
-def wrist_camera(points, rotation, error=np.zeros(6)):
-    """The robot's camera for an arm's points (8, 3) and tool rotation (3, 3), as iiwa.chain gives them.
+def wrist_camera(model, q, error=np.zeros(6)):
+    """The robot's camera at joint angles (n,) of a model.Model.
 
     `error` (6,) is what hand-eye calibration missed: a shift in m and a rotation vector in rad about the camera, tool frame.
     """
-    turn = rotation @ cv2.Rodrigues(error[3:])[0] @ iiwa.DOWN.T
-    return Camera(FOCAL, SIZE, turn @ LOOK, points[7] + rotation @ (iiwa.DOWN.T @ MOUNT + error[:3]))
+    _, points, rotation = model.chain(q)
+    turn = rotation @ cv2.Rodrigues(error[3:])[0] @ model.down.T
+    return Camera(FOCAL, SIZE, turn @ LOOK, points[-1] + rotation @ (model.down.T @ MOUNT + error[:3]))
 
 
 def _table():
@@ -134,10 +135,10 @@ def _box(image, camera, box):
 
 
 def render(camera, box, points, hand=False, arm=False):
-    """Image (height, width, 3) uint8 BGR of a box pose (3,), the pusher at the arm's points (8, 3), a hand and the arm."""
+    """Image (height, width, 3) uint8 BGR of a box pose (3,), the pusher at the arm's points (n + 2, 3), a hand and the arm."""
     image = cv2.warpPerspective(_TABLE, camera.plane(0.0) @ _TABLE_TO_M, camera.size, flags=cv2.INTER_LINEAR,
                                 borderMode=cv2.BORDER_CONSTANT, borderValue=(225, 222, 218))
-    ball, flange = points[7], points[7] + (points[6] - points[7]) * iiwa.TOOL / np.linalg.norm(points[6] - points[7])
+    ball, flange = points[-1], points[-2]
     waist = ball + (flange - ball) * np.clip((task.BOX[2] - ball[2]) / (flange[2] - ball[2]), 0, 1)
     point = box[:2] + geometry.rotation(box[2]) @ geometry.nearest(box, ball[:2])[1]
     behind = (ball[:2] - point) @ (camera.position[:2] - point) > 0  # the box, which a plane at `point` parts from the ball
@@ -149,11 +150,11 @@ def render(camera, box, points, hand=False, arm=False):
         _box(image, camera, box)
     _limb(image, camera, waist, flange, STEM, STEM, STEEL)
     if arm:
-        joints = [*points[[0, 1, 3, 5]], flange]
-        for a, b, r, s in zip(joints[:-1], joints[1:], (0.09, 0.08, 0.075, 0.06), (0.08, 0.075, 0.065, 0.045)):
-            _limb(image, camera, a, b, r, s, STEEL)
-        for joint, radius in zip(joints[1:-1], (0.082, 0.078, 0.068)):
-            _limb(image, camera, joint, joint, 0.6 * radius, 0.6 * radius, ORANGE)
+        joints = [points[0], *(b for a, b in zip(points[:-2], points[1:-1]) if np.linalg.norm(b - a) > NEAR)]
+        for a, b, wide in zip(joints[:-1], joints[1:], np.linspace(0.09, 0.06, len(joints) - 1)):
+            _limb(image, camera, a, b, wide, wide - 0.01, STEEL)
+        for joint in joints[1:-1]:
+            _limb(image, camera, joint, joint, 0.045, 0.045, ORANGE)
     if hand:  # flat over the tags, its arm coming from +x
         palm = np.array([*box[:2], HAND])
         _limb(image, camera, palm + [0.02, 0, 0], palm + [0.45, 0.12, 0.12], 0.05, 0.045, SKIN)

@@ -3,15 +3,17 @@ import cv2
 import numpy as np
 
 from common import film, observation, task
-from common.robot import iiwa, scene
+from common.robot import scene
 
 FOUND = (60, 220, 60)
+WIDTH, TOP = 960, 360  # pixels of a composite: scene and camera above, as high as TOP; below, from above and the curves
+CURVES = (("force", 15.0, "N"), ("sigma", 30.0, "mm"), ("age of the sight", 10.0, "s"))  # with the top of each scale
 
 
 def panels(row, tick):
     """RGB images of a tick: from outside, by the robot's camera, from above; without a true pose the estimate stands for it."""
     box = row["estimated"] if np.isnan(row["true"]).any() else row["true"]
-    outside = scene.render(scene.OVERVIEW, box, iiwa.chain(row["joints"])[1], row["covered"], arm=True)
+    outside = scene.render(scene.OVERVIEW, box, row["points"], row["covered"], arm=True)
     seen = row["image"].copy()
     cv2.polylines(seen, list(np.round(16 * row["corners"]).astype(np.int32)), True, FOUND, 2, cv2.LINE_AA, 4)
     state, noisy, s_hat = (np.concatenate([pose, row["pusher"], row["force"]]) for pose in (box, row["seen"], row["estimated"]))
@@ -31,3 +33,25 @@ def write(rows, path, camera_path):
     film.write_mp4(path, (np.hstack([cv2.resize(view, (view.shape[1] * height // view.shape[0], height))
                                      for view in panels(row, tick)]) for tick, row in enumerate(rows)))
     film.write_mp4(camera_path, (row["image"][..., ::-1] for row in rows))
+
+
+def curves_of(row):
+    """The values of a tick in CURVES: the force felt, the estimate's standard deviation in the plane, the sight's age."""
+    return np.linalg.norm(row["force"]), 1e3 * np.linalg.norm(row["sigma"][:2] * task.HALF), row["age"] / task.RATE
+
+
+def composite(row, tick, history):
+    """RGB image (600, WIDTH, 3) of a tick: its three panels and, over the run, its curves; history is a list of curves_of."""
+    half, strip = WIDTH // 2, WIDTH // 12
+    outside, seen, above = (cv2.resize(view, (half, height)) for view, height in zip(panels(row, tick), (TOP, TOP, half // 2)))
+    plot, values = np.full((half // 2, half, 3), 255, np.uint8), np.array(history).reshape(-1, len(CURVES))
+    x = np.linspace(0, half, task.HORIZON)[:len(values)]
+    for i, (name, top, unit) in enumerate(CURVES):
+        bottom = (i + 1) * strip - 1
+        y = bottom - 3 - (strip - 8) * np.clip(values[:, i] / top, 0, 1)
+        points = np.round(16 * np.column_stack([x, y])).astype(np.int32)
+        cv2.line(plot, (0, bottom), (half, bottom), (220, 220, 220), 1)
+        cv2.polylines(plot, [points], False, film.ESTIMATE, 2, cv2.LINE_AA, 4)
+        words = f"{name} {values[-1, i]:.1f} {unit} (of {top:.0f})"
+        cv2.putText(plot, words, (8, i * strip + 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, film.TEXT, 1, cv2.LINE_AA)
+    return np.vstack([np.hstack([outside, seen]), np.hstack([above, plot])])

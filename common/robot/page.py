@@ -1,0 +1,152 @@
+"""A page on this machine: what the robot sees, believes and does, and a stop button; one can join in with the simulated arm."""
+import contextlib
+import json
+import os
+import threading
+from collections import deque
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import cv2
+import numpy as np
+
+from common import draw, task
+from common.files import UserError
+from common.robot import views
+
+HTML = """<!doctype html><meta charset="utf-8"><title>Pushing under occlusion</title>
+<style>body { font: 16px sans-serif; max-width: 960px; margin: 1em auto } img { width: 100%; user-select: none }
+button { font: inherit; padding: .5em 1em } #stop { background: #c33; color: white }</style>
+<b id="state"></b><img id="view" draggable="false" alt="no run yet"><p><button id="stop">Stop the arm</button>
+<span JOIN><button id="cover">Hold to cover the tags</button> <button id="next">Next run</button>
+or drag the box in the view from above; such a run is not counted.</span>
+<script>
+const post = path => fetch(path, {method: "POST"}).catch(() => {})
+let covering = false, drag = null, way = [0, 0]
+async function follow() {
+  try {
+    const reply = await fetch("/frame"), image = await reply.blob()
+    state.textContent = JSON.parse(reply.headers.get("State"))
+    if (image.size) { URL.revokeObjectURL(view.src); view.src = URL.createObjectURL(image) }
+  } catch { state.textContent = "No answer: the program has ended." }
+  setTimeout(follow, 60)
+}
+document.getElementById("stop").onclick = () => post("/stop")
+next.onclick = () => post("/next")
+cover.onpointerdown = () => covering = true
+view.onpointerdown = event => {
+  if (event.offsetX < view.clientWidth / 2 && event.offsetY > view.clientWidth * TOP / WIDTH) drag = event
+}
+onpointermove = event => {
+  const metres = drag ? 2 * VIEW / view.clientWidth : 0
+  if (drag) way = [way[0] + (event.clientX - drag.clientX) * metres, way[1] - (event.clientY - drag.clientY) * metres]
+  drag = drag && event
+}
+onpointerup = onblur = () => { covering = false; drag = null }
+setInterval(() => {
+  if (covering) post("/cover")
+  if (way[0] || way[1]) post(`/nudge/${way[0].toFixed(4)}/${way[1].toFixed(4)}`)
+  way = [0, 0]
+}, 100)
+follow()
+</script>""".replace("WIDTH", str(views.WIDTH)).replace("TOP", str(views.TOP)).replace("VIEW", str(draw.VIEW))
+
+
+class Page(ThreadingHTTPServer):
+    """Serves the page on the loopback address until the context ends; what is shown is drawn in a thread of its own.
+
+    `arm` is the safety.Guarded that its button stops, None until there is one. UserError where the port cannot be had.
+    """
+
+    daemon_threads, request_queue_size, arm, title, jpeg, latest = True, 64, None, "", b"", None
+
+    def __init__(self, port=8006, *more):
+        try:
+            super().__init__(("127.0.0.1", port, *more), Request)
+        except (OSError, OverflowError, TypeError) as error:
+            raise UserError(f"--view {port}: this port cannot be had ({error}); give another") from None
+        self.fresh, self.history, self.drawing = threading.Event(), deque(maxlen=task.HORIZON), True
+        self.threads = [threading.Thread(target=work, daemon=True) for work in (self.draw, lambda: self.serve_forever(0.1))]
+        for thread in self.threads:
+            thread.start()
+
+    def __exit__(self, *error):
+        self.drawing = False
+        self.fresh.set()
+        self.shutdown()
+        self.server_close()
+        for thread in self.threads:  # a thread in OpenCV would abort the interpreter's end
+            thread.join(5)
+
+    def begin(self, title):
+        """A run begins."""
+        self.title = title
+        self.history.clear()
+
+    def show(self, row, tick):
+        """A tick of 06_robot.control, to be drawn when there is time, if it is the newest then."""
+        self.history.append(views.curves_of(row))
+        self.latest = row, tick
+        self.fresh.set()
+
+    def draw(self):
+        with contextlib.suppress(OSError):  # a thread has a priority of its own on Linux only
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+        while self.fresh.wait() and self.drawing:
+            self.fresh.clear()
+            image = views.composite(*self.latest, list(self.history))
+            self.jpeg = cv2.imencode(".jpg", image[..., ::-1])[1].tobytes()
+
+    def state(self):
+        """The run, and what the guard says."""
+        joined = " (joined, not counted)" if getattr(getattr(self.arm, "arm", None), "joined", False) else ""
+        return f"{self.title}{joined}: {getattr(self.arm, 'stopped', '') or 'the guard is content'}"
+
+    def act(self, word, *numbers):
+        """What a button asks for; all but the stop is for the simulated arm. ValueError if it is none."""
+        way = np.array(numbers, float)
+        sizes = {"stop": 0, "cover": 0, "next": 0, "nudge": 2}
+        if sizes.get(word) != len(way) or not (np.abs(way) < 0.1).all():  # nan is not
+            raise ValueError
+        if word == "stop":
+            self.arm.halt("the page's stop button")
+        if hasattr(self.arm.arm, "join"):
+            self.arm.arm.join(word, way)
+
+    def handle_error(self, *connection):
+        """A tab that was closed is no matter."""
+
+
+class Request(BaseHTTPRequestHandler):
+    timeout = 2  # s that a visitor may keep silent
+
+    def own(self):
+        """Whether the page is called by its own name: another may be a stranger's, bent to this machine."""
+        return self.headers.get("Host") in [f"{name}:{self.server.server_port}" for name in ("127.0.0.1", "localhost")]
+
+    def do_GET(self):
+        join = self.server.arm is None or hasattr(self.server.arm.arm, "join")
+        parts = {"/": (HTML.replace("JOIN", "" if join else "hidden").encode(), "text/html"),
+                 "/frame": (self.server.jpeg, "image/jpeg")}
+        if not self.own() or self.path not in parts:
+            return self.answer(404)
+        self.answer(200, *parts[self.path])
+
+    def do_POST(self):
+        if not self.own() or self.headers.get("Origin") != f"http://{self.headers['Host']}":
+            return self.answer(403)
+        try:
+            self.server.act(*self.path[1:].split("/"))
+            self.answer(204)
+        except (ValueError, AttributeError):  # the last where there is no arm yet
+            self.answer(404)
+
+    def answer(self, code, body=b"", kind="text/plain"):
+        self.send_response(code)
+        for name, value in {"Content-Type": kind, "Content-Length": len(body), "State": json.dumps(self.server.state()),
+                            "Cache-Control": "no-store", "Content-Security-Policy": "frame-ancestors 'none'"}.items():
+            self.send_header(name, str(value))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *words):
+        """Requests are no news."""
