@@ -81,7 +81,7 @@ def inputs_of(cfg):
         raise UserError(f"--sizes {cfg.sizes}: pi_priv has {sizes}; use those, or --no-warm-start")
     if kind := TRAINED[cfg.method].estimator:
         paths["estimator"] = runs.find(cfg, "03_train_estimator", "estimator.safetensors", kind)
-    return paths
+    return paths or nets("policy")  # what reads no net has pi_priv's world all the same
 
 
 def start_from(net, trained, first=0):

@@ -58,10 +58,9 @@ PRESETS = {"pretrained": dict(weights=Path(__file__).parent.parent / "pretrained
 
 
 def model(world, feet):
-    """MuJoCo's model of a box on feet x feet points (those at the corners, or in the middle of equal parts) and a pusher."""
+    """MuJoCo's model of a box on feet x feet points, evenly spaced from corner to corner, and a pusher."""
     half = np.array(world.box) / 2
-    places = np.linspace(-1, 1, feet) * (1 if feet == 2 else 1 - 1 / feet)
-    points = [(x * half[0], y * half[1]) for x in places for y in places]
+    points = [(x, y) for x in np.linspace(-half[0], half[0], feet) for y in np.linspace(-half[1], half[1], feet)]
     name = "foot{}".format
     return mujoco.MjModel.from_xml_string(MODEL.format(
         dt=1 / task.RATE / SUB_STEPS, contact=CONTACT, x=half[0], y=half[1], z=half[2],

@@ -2,7 +2,10 @@ import csv
 import importlib
 import json
 import math
+import subprocess
+import sys
 from dataclasses import asdict
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -325,3 +328,10 @@ def test_the_film_marks_an_occlusion():
     seen = film.frame(state, o, belief, 0)
     hidden = film.frame(state, np.append(o[:8], 1.0), belief, 0)
     assert tuple(hidden[0, 0]) == film.HELD and tuple(seen[0, 0]) != film.HELD
+
+
+def test_without_mujoco_the_second_simulator_says_what_to_install():
+    script = Path(__file__).parent / "second_simulator.py"
+    code = f"import runpy, sys; sys.modules['mujoco'] = None; runpy.run_path({str(script)!r}, run_name='__main__')"
+    end = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert end.returncode and end.stderr == "error: no MuJoCo here: pip install mujoco\n"

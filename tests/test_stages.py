@@ -395,6 +395,14 @@ def test_a_stale_input_names_the_stage_to_redo(copy, call):
     assert is_mistake(*call(out, "04_train_policy"), "stale", "--force")
 
 
+def test_what_reads_no_net_is_trained_in_the_world_of_01_all_the_same(copy, call):
+    out = copy(0)
+    assert call(out, "01_train_privileged", "--starts", "centre", "--mass", "1", "2")[2] == 0
+    assert call(out, "04_train_policy", "--method", "end_to_end", "--no-warm-start")[2] == 0
+    world = json.loads((out / "smoke/04_train_policy/end_to_end/seed0/config.json").read_text())["world"]
+    assert (world["starts"], world["mass"], world["box"]) == ("centre", [1.0, 2.0], [0.12, 0.10, 0.07])
+
+
 def test_a_box_that_the_robot_is_not_made_for_is_one_line(copy, call):
     out = copy(4)
     for path in (out / "smoke").glob("0[34]*/**/config.json"):
