@@ -42,8 +42,8 @@ def by_start(env, actor, seed, lists=8):
         if t == 0:
             centres.append(env.unwrapped.box[:, :2])
 
-    for k in range(lists):
-        won.append(episodes.play(env, actor, 10**7 + lists * seed + k, record=keep)[0])
+    for k in range(lists * ranks.COUNT):  # rank 0 has but a share of the worlds
+        won.append(episodes.play(env, actor, 10**7 + 1000 * seed + k, record=keep)[0])
     return np.concatenate(centres), np.concatenate(won)
 
 

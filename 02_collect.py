@@ -118,7 +118,7 @@ def join(run, name, parts):
 
 def remove_parts(run):
     for part in run.dir.glob("part_*.npz"):
-        part.unlink()
+        part.unlink(missing_ok=True)
 
 
 def main(cfg):
@@ -133,7 +133,7 @@ def main(cfg):
     if run.skip():
         return remove_parts(run)
     todo = {run.dir / f"part_{k:05d}.npz": (k, *job) for k, job in enumerate(jobs(cfg, len(paths)))}
-    unplayed = [part for part in todo if not part.exists()]
+    unplayed = ranks.lead(lambda: [part for part in todo if not part.exists()])()
     clock, total = time.perf_counter(), sum(todo[part][3] for part in unplayed)
     progress = bar(total, "02_collect", unit="trajectory")
 

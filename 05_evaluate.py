@@ -178,7 +178,7 @@ def main(cfg):
     sources |= {name: [sha[m.method, m.seed], sha.get(METHODS[m.method].estimator)] for name, m in todo.items()}
     keys = {name: f"{name} {hashlib.sha256(repr(files).encode()).hexdigest()[:16]}" for name, files in sources.items()}
     kept = ranks.lead(load_json)(run.dir / "measurements.json", "delete it, and the same command measures anew") or {}
-    if run.finished and set(keys.values()) <= kept.keys() and (run.dir / "results.json").exists():
+    if run.finished and set(keys.values()) <= kept.keys() and ranks.lead((run.dir / "results.json").exists)():
         report(run)
         return run.skip()
 

@@ -8,6 +8,7 @@ cd "$(dirname "$0")"
 what=${1:-quick} processes=${2:-1}
 case $what in pretrained|smoke|quick|laptop|paper|test) ;; *) echo "error: $what: say pretrained, smoke, quick, laptop, paper or test" >&2; exit 2 ;; esac
 [ $# -le 2 ] || { echo "error: a preset and a number only; for settings run the scripts by hand (see README.md)" >&2; exit 2; }
+[ "$what" != test ] || [ $# -le 1 ] || { echo "error: test is one word" >&2; exit 2; }
 [[ $processes =~ ^[1-9][0-9]*$ ]] || { echo "error: $processes: say how many processes, 1 or more" >&2; exit 2; }
 
 if ! cmp -s requirements.txt .venv/installed.txt; then

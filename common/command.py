@@ -4,6 +4,7 @@ import errno
 import io
 import os
 import sys
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
@@ -112,9 +113,13 @@ def main(config_class: type, presets: dict[str, dict], run: Callable, doc: str):
         message, code = f"cannot read or write ({failure}): make room, or choose another --out", 2
     except Exception as failure:
         ranks.let_the_cause_speak(failure)
-        raise
-    print("error:", " ".join(message.split()), file=sys.stderr)
-    sys.exit(code)
+        if ranks.COUNT == 1:
+            raise
+        traceback.print_exc()
+        os._exit(1)  # a thread of this rank may wait in a collective that the others never call
+    if code == 2 or not ranks.RANK:
+        print("error:", " ".join(message.split()), file=sys.stderr, flush=True)
+    (sys.exit if ranks.COUNT == 1 else os._exit)(code)
 
 
 def device_of(cfg: Stage) -> torch.device:

@@ -13,13 +13,15 @@ import torch.distributed as dist
 
 RANK, COUNT, LOCAL, LOCAL_COUNT = (int(os.environ.get(name, default)) for name, default in (
     ("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0), ("LOCAL_WORLD_SIZE", 1)))  # of all machines; of this one
-PATIENCE = timedelta(days=1)  # the others wait while rank 0 draws; an ended process is noticed at once
-groups = [None, None]  # one for each thread that calls collectives: on another rank theirs come in another order
+PATIENCE = timedelta(days=1)  # the others wait while rank 0 draws; that a process has ended is noticed at once all the same
+groups = [None, None]  # one for each thread that calls collectives: on another rank theirs come in another order; 30 minutes
 
 
 def begin(device):
     """Meets the other processes: gloo on CPUs, and nccl with a GPU each."""
     if COUNT > 1:
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
         dist.init_process_group("gloo" if device.type == "cpu" else "cpu:gloo,cuda:nccl", timeout=PATIENCE)
         groups[:] = [dist.new_group() for _ in groups]
 
@@ -94,7 +96,7 @@ def average(parameters, numbers, weight, group=None):
     *gradients, numbers = (flat[:-1] / flat[-1]).split([*(p.numel() for p in parameters), len(numbers)])
     for parameter, gradient in zip(parameters, gradients):
         parameter.grad = gradient.view_as(parameter)
-    return numbers, flat[-1].item()
+    return numbers, flat[-1]
 
 
 def let_the_cause_speak(failure):

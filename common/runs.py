@@ -23,7 +23,6 @@ from common.files import UserError, claim, digest, load_json, release, save_json
 from common.task import World
 
 VERSIONS = ("torch", "numpy", "pymunk", "gymnasium", "opencv-python-headless", "clarabel")
-START = ["torchrun", f"--nproc-per-node {ranks.COUNT}"] if ranks.COUNT > 1 else ["python"]
 _STARTED = time.monotonic()
 
 
@@ -159,7 +158,7 @@ class Run:
         self.settings = [(field, as_json(value)) for field, value in flat(cfg) if field.name not in shared and (
             reads is None or field.name in {"seed", *reads})]
         self.record = {
-            "command": " ".join([*START, Path(words[0]).name, *words[1:]]),
+            "command": " ".join(["torchrun" if ranks.COUNT > 1 else "python", Path(words[0]).name, *words[1:]]),
             "processes": ranks.COUNT,
             "versions": {"python": sys.version.split()[0]} | {name: version(name) for name in VERSIONS},
             "settings": {field.name: value for field, value in self.settings},

@@ -25,12 +25,12 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
     """Adam over shuffled trajectories, validated on those of `held_out`; False when the time limit stopped it.
 
     An epoch is a resume point, a row of metrics, and draws its noise and occlusions afresh. loss(o, s, mask, generator) of
-    a batch of trajectories.observe is the mean over the steps it looks at; it runs in two threads at once, draws from the
+    a batch of trajectories.observe is the mean over the steps it looks at; it may run in two threads at once, draws from the
     generator alone, and needs every parameter. save() is called on rank 0 after each epoch of the lowest validation loss so
     far. Raises UserError: that is not finite, or there are more processes than trajectories in a mini-batch.
     """
-    if sequences < ranks.COUNT:
-        raise UserError(f"{ranks.COUNT} processes share a mini-batch of {sequences} trajectories: start at most so many")
+    if (most := min(sequences, len(data[1]) - 1)) < ranks.COUNT:
+        raise UserError(f"{ranks.COUNT} processes share a mini-batch of {most} trajectories: start at most so many")
     parameters = list(net.parameters())
     device, optimizer = parameters[0].device, torch.optim.Adam(parameters, lr=lr)
     count, first, best, lr_end = len(data[1]) - 1, 0, math.inf, lr if lr_end is None else lr_end
@@ -43,7 +43,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
         rng = np.random.default_rng([seed, epoch])
         draws = torch.Generator().manual_seed(int(np.random.default_rng([seed, epoch, ranks.RANK]).integers(2**62)))
         parts = [index[ranks.RANK::ranks.COUNT] for index in trajectories.shuffled(data, sequences, rng)
-                 if len(index) >= ranks.COUNT]
+                 if len(index) >= ranks.COUNT]  # else it is left out, in this epoch
 
         def observed(k):  # 1: to train; other numbers elsewhere
             return trajectories.observe(data, parts[k], (seed, epoch, k, 1, ranks.RANK), device, run.world)
@@ -60,7 +60,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
                 parameter.grad *= steps / usual
             optimizer.step()
             losses.append(mean.item())
-            weights.append(steps)
+            weights.append(float(steps))
             progress.update()
             progress.set_postfix_str(f"loss {losses[-1]:.3f}", refresh=False)
         validation_loss = validate(loss, held_out, validation, sequences, device, run.world)

@@ -43,7 +43,8 @@ def ended_episodes(batch, running):
 
 def held_out_success(env, actor, seed):
     """Success in the study's episodes at 1x tolerance, the same ones each time, which no update sees; each rank plays some."""
-    with torch.random.fork_rng():
+    device = next(actor.parameters()).device
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
         success = episodes.play(env, actor, seed=10**6 + seed + 2**32 * ranks.RANK)[0]
     won, count = ranks.totals(success.sum(), len(success))

@@ -27,7 +27,7 @@ def rate(work, steps, seconds=2.0):
     """Steps per second of work(), which does `steps` of them, in all processes."""
     work()
     begin, count = time.perf_counter(), 0
-    while ranks.lead(time.perf_counter)() - ranks.lead(lambda: begin)() < seconds:
+    while ranks.lead(lambda: time.perf_counter() - begin)() < seconds:
         work()
         count += steps
     return count / (time.perf_counter() - begin)
@@ -101,7 +101,7 @@ def estimate(preset, most, batches=30):
     data = rng.uniform(-0.1, 0.1, (offsets[-1], 7)).astype(np.float32), offsets
     with tempfile.TemporaryDirectory() as folder:
         run = SimpleNamespace(dir=Path(folder) / "seed0", log=lambda **row: None, save_resume=lambda state: None,
-                              load_resume=lambda: None, out_of_time=lambda: False)
+                              load_resume=lambda: None, out_of_time=lambda: False, world=task.World())
         begin = time.perf_counter()
         stage.train(run, cfg, data, data, torch.device("cpu"))
         per_s = batches / (time.perf_counter() - begin)

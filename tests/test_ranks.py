@@ -70,7 +70,7 @@ def regression(index):
     part = [z[:, index].contiguous() for z in (x, mask)]
     loss = lambda x, mask, generator: ((net(x)[..., 0] - 1).square() * mask).sum() / mask.sum()  # noqa: E731
     mean, steps = ranks.average(parameters, *speed.set_gradient(loss, [part], torch.Generator(), parameters))
-    return {"loss": mean, "steps": steps, "gradient": [p.grad for p in parameters]}
+    return {"loss": mean, "steps": float(steps), "gradient": [p.grad for p in parameters]}
 
 
 def ten_updates():
@@ -97,6 +97,17 @@ def mortal(script, *args):
     calls, whole = iter(range(9)), ppo.rollout
     if ranks.RANK == 1:
         ppo.rollout = lambda *a: os.kill(os.getpid(), signal.SIGKILL) if next(calls) == 4 else whole(*a)
+    play(script, *args)
+
+
+def wounded(script, *args):
+    """A stage of which rank 1 fails in one of its two nets, while the other's collectives wait."""
+    if ranks.RANK == 1:
+        ppo.policy_loss = lambda *a: 1 / 0
+    play(script, *args)
+
+
+def play(script, *args):
     stage, sys.argv = import_module(script), [script, *args]
     command.main(stage.Config, stage.PRESETS, stage.main, stage.__doc__)
 
@@ -167,6 +178,12 @@ def test_killed_all_or_one_they_go_on_and_end_bit_for_bit_as_uninterrupted(tmp_p
     assert whole.read_bytes() == killed.read_bytes()
 
 
+def test_a_failure_in_one_net_of_one_rank_ends_all_and_is_told(tmp_path):
+    begin = time.monotonic()
+    stderr = ends(torchrun(__file__, "wounded", "01_train_privileged", "smoke", "--out", tmp_path / "runs"), 1)[1]
+    assert time.monotonic() - begin < 60 and "ZeroDivisionError" in stderr
+
+
 @pytest.mark.parametrize("words, told", [
     (["01_train_privileged", "--num-envs", 1], "2 processes share 1 worlds"),
     (["03_train_estimator"], "train_states.npy is missing"),
@@ -194,5 +211,4 @@ def test_a_study_of_two_processes(study, tmp_path):
 
 
 if __name__ == "__main__":
-    speed.set_up(1)
-    {"measure": measure, "mortal": mortal}[sys.argv[1]](*sys.argv[2:])
+    {"measure": measure, "mortal": mortal, "wounded": wounded}[sys.argv[1]](*sys.argv[2:])
