@@ -26,7 +26,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
     is set, `final_obs` (N, 8) and `final_state` (N, 7) hold its end, and observation and `state` start the next episode.
 
     Args: world: task.World, what is drawn for an episode; starts: other ones than the world's; sub_steps: physics steps a
-    control step; threads: as in simulator.Worlds; they change no bit, and pay from about 2,000 worlds a thread on.
+    control step; threads: as in simulator.Worlds; they change no bit.
 
     Attributes:
         worlds: simulator.Worlds, the physics; its box, pusher, force, dynamics (here the drawn ones) and state are here too.

@@ -24,7 +24,8 @@ _CONTACT = batch.ArbiterFields.TOTAL_IMPULSE | batch.ArbiterFields.POINT_A_1
 def _norm(twist, p):
     """(|(x, y)|^p + |z|^p)^(1/p) of (N, 3): (N,)."""
     if p == 2:
-        return np.linalg.norm(twist, axis=1)
+        x, y, z = twist.T
+        return np.sqrt(x * x + y * y + z * z)  # np.linalg.norm's bits, in a quarter of its time
     return (np.hypot(twist[:, 0], twist[:, 1])**p + np.abs(twist[:, 2])**p)**(1 / p)
 
 

@@ -11,7 +11,8 @@ from torch.nn import functional as F
 
 WIDTH = 16  # sequences side by side in PPO are a multiple of it: at 149, a prime, oneDNN's LSTM takes 3 times as long as at 144
 one_thread = {"initializer": torch.set_num_threads, "initargs": (1,)}  # OpenMP keeps its number per thread
-pool = ThreadPoolExecutor(2, **one_thread)  # runs independent jobs side by side; a job must not wait for another
+workers = 2  # threads of the pool
+pool = ThreadPoolExecutor(workers, **one_thread)  # runs independent jobs side by side; a job must not wait for another
 
 
 def set_up(threads=2, processes=1):
@@ -23,12 +24,11 @@ def set_up(threads=2, processes=1):
     a training takes and frees arrays of the same sizes all the time, whose pages the kernel would zero anew, a fifth of PPO's
     time: with glibc they stay, in one arena for all threads (in a thread's own none above 64 MB would).
     """
-    global pool
+    global pool, workers
     torch.set_num_threads(1)
     torch.backends.cuda.matmul.allow_tf32 = True  # as cuDNN's LSTM does anyway
-    if processes > 1:
-        threads = max(1, min(threads, os.cpu_count() // processes))
-    pool = ThreadPoolExecutor(threads, **one_thread)
+    workers = threads if processes == 1 else max(1, min(threads, os.cpu_count() // processes))
+    pool = ThreadPoolExecutor(workers, **one_thread)
     with contextlib.suppress(AttributeError, OSError, TypeError):
         mallopt = ctypes.CDLL(None).mallopt
         for parameter, value in ((-8, 1), (-4, 0), (-1, -1)):  # M_ARENA_MAX, M_MMAP_MAX, M_TRIM_THRESHOLD
