@@ -31,7 +31,7 @@ class Config(command.Reader):
     sweep_episodes: int = 2000  # episodes for each point of the occlusion-duration sweep (sec. 5.3)
     switch_episodes: int = 20_000  # episodes for the contact switches (sec. 5.4)
     passes: int = 50  # M, stochastic passes of the estimator in the loop (sec. 4)
-    other_episodes: int = 1000  # episodes for each policy in each of the other worlds
+    other_episodes: int | None = 1000  # episodes for each policy in each of the other worlds; none: these are left out
     test: int = 150_000  # most trajectories of the test set (appendix B.2)
     test_passes: int = 50  # M on the test set
     num_envs: int = 2000  # worlds at once: so many episodes of the list share a seed, so another number is another list
@@ -40,7 +40,7 @@ class Config(command.Reader):
 PRESETS = {
     "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, other_episodes=100, passes=10, num_envs=200,
                        weights=Path(__file__).parent / "pretrained"),
-    "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, other_episodes=2, passes=2, test=12,
+    "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, other_episodes=None, passes=2, test=12,
                   num_envs=16),
     "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, other_episodes=300, passes=20, test=2000, num_envs=300),
     "laptop": dict(switch_episodes=2000, passes=10, num_envs=1000),

@@ -21,7 +21,7 @@ if ! cmp -s requirements.txt .venv/installed.txt; then
 fi
 
 if [ "$what" = test ]; then
-    exec .venv/bin/python -m pytest -q
+    exec .venv/bin/python -m pytest -q -n 2 --dist loadfile
 fi
 scripts=(0*.py)
 [ "$what" != pretrained ] || scripts=(05*.py 06*.py)

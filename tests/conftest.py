@@ -1,3 +1,4 @@
+import fcntl
 import subprocess
 import sys
 from pathlib import Path
@@ -38,9 +39,15 @@ def run(out, script, *args):
 
 
 @pytest.fixture(scope="session")
-def study(tmp_path_factory):
-    """The root of a whole smoke study. Not to be changed."""
-    out = tmp_path_factory.mktemp("study") / "runs"
-    for script in SCRIPTS:
-        run(out, script)
+def study(tmp_path_factory, worker_id):
+    """The root of a whole smoke study, made once for all of pytest's workers. Not to be changed."""
+    base = tmp_path_factory.getbasetemp()
+    out = (base if worker_id == "master" else base.parent) / "study" / "runs"
+    out.parent.mkdir(exist_ok=True)
+    with open(out.parent / "lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (out / "done").exists():
+            for script in SCRIPTS:
+                run(out, script)
+            (out / "done").touch()
     return out

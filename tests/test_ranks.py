@@ -28,6 +28,11 @@ def torchrun(*words, count=2):
                             env=os.environ | {"OMP_NUM_THREADS": "1"})
 
 
+def alone(*words):
+    process = subprocess.run([sys.executable, *map(str, words)], text=True, capture_output=True)
+    return process.stdout, process.stderr, process.returncode
+
+
 def ends(process, code=0):
     """What a command printed, when it ends as told."""
     stdout, stderr = process.communicate(timeout=240)
@@ -171,8 +176,8 @@ def test_killed_all_or_one_they_go_on_and_end_bit_for_bit_as_uninterrupted(tmp_p
     begin = time.monotonic()
     stderr = ends(torchrun(__file__, "mortal", "01_train_privileged", "smoke", "--out", tmp_path / "killed", "--updates", 30), 1)[1]
     assert time.monotonic() - begin < 60 and "Signal 9" in stderr
-    stderr = ends(torchrun(ROOT / "01_train_privileged.py", "smoke", "--out", tmp_path / "killed", "--updates", 30, count=3), 2)[1]
-    assert "was begun with 2 processes, not 3: start as many, or use --force" in stderr
+    stdout, stderr, code = alone(ROOT / "01_train_privileged.py", "smoke", "--out", tmp_path / "killed", "--updates", 30)
+    assert code == 2 and "was begun with 2 processes, not 1: start as many, or use --force" in stderr
     ends(trained(tmp_path / "killed"))
     whole, killed = (tmp_path / name / here / "policy.safetensors" for name in ("whole", "killed"))
     assert whole.read_bytes() == killed.read_bytes()
@@ -200,8 +205,9 @@ def test_a_study_of_two_processes(study, tmp_path):
     """02 and 05 give the bits of one process, from the same nets; 03 and 04 go through between them."""
     out, again = tmp_path / "runs", tmp_path / "again"
     copytree(study / "smoke" / "01_train_privileged", out / "smoke" / "01_train_privileged")
-    for script in SCRIPTS[1:4]:
-        ends(torchrun(ROOT / f"{script}.py", "smoke", "--out", out))
+    for script, *method in [SCRIPTS[1]], [SCRIPTS[2], "--method", "ours"], [SCRIPTS[3], "--method", "est"], [
+            SCRIPTS[3], "--method", "behavior_cloning"]:
+        ends(torchrun(ROOT / f"{script}.py", "smoke", "--out", out, *method))
     for path in (study / "smoke" / "02_collect" / "seed0").glob("*.npy"):
         assert path.read_bytes() == (out / path.relative_to(study)).read_bytes()
     copytree(study, again, ignore=lambda folder, names: [name for name in names if name.startswith(("05", "06"))])
