@@ -37,7 +37,7 @@ OUTPUTS = {
                           "likelihood_loss.png", "mse_loss.png", "bc_loss.png"],
     "06_robot/seed0": ["summary.json", "robot.png", "natural_000.npz", "hand_5s_000.npz", "hand_full_000.npz"],
 } | {f"04_train_policy/{m}/seed0": ["policy.safetensors", "training.png", "success_rate.png"]
-     for m in POLICIES - {"behavior_cloning"}}
+     for m in sorted(POLICIES - {"behavior_cloning"})}
 
 
 @pytest.fixture
