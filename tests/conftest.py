@@ -46,8 +46,8 @@ def study(tmp_path_factory, worker_id):
     out.parent.mkdir(exist_ok=True)
     with open(out.parent / "lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (out / "done").exists():
+        if not (out.parent / "done").exists():
             for script in SCRIPTS:
                 run(out, script)
-            (out / "done").touch()
+            (out.parent / "done").touch()
     return out

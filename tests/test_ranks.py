@@ -160,7 +160,7 @@ def wait_for(path, process, seconds=60):
 
 
 def trained(out, *words):
-    return torchrun(ROOT / "01_train_privileged.py", "smoke", "--out", out, "--updates", 30, *words)
+    return torchrun(ROOT / "01_train_privileged.py", "smoke", "--out", out, "--updates", 16, *words)
 
 
 def test_killed_all_or_one_they_go_on_and_end_bit_for_bit_as_uninterrupted(tmp_path):
@@ -174,9 +174,9 @@ def test_killed_all_or_one_they_go_on_and_end_bit_for_bit_as_uninterrupted(tmp_p
     process.communicate()
     assert len(workers) == 2 and not (tmp_path / "killed" / here / "policy.safetensors").exists()
     begin = time.monotonic()
-    stderr = ends(torchrun(__file__, "mortal", "01_train_privileged", "smoke", "--out", tmp_path / "killed", "--updates", 30), 1)[1]
+    stderr = ends(torchrun(__file__, "mortal", "01_train_privileged", "smoke", "--out", tmp_path / "killed", "--updates", 16), 1)[1]
     assert time.monotonic() - begin < 60 and "Signal 9" in stderr
-    stdout, stderr, code = alone(ROOT / "01_train_privileged.py", "smoke", "--out", tmp_path / "killed", "--updates", 30)
+    stdout, stderr, code = alone(ROOT / "01_train_privileged.py", "smoke", "--out", tmp_path / "killed", "--updates", 16)
     assert code == 2 and "was begun with 2 processes, not 1: start as many, or use --force" in stderr
     ends(trained(tmp_path / "killed"))
     whole, killed = (tmp_path / name / here / "policy.safetensors" for name in ("whole", "killed"))
