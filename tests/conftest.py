@@ -42,12 +42,13 @@ def run(out, script, *args):
 def study(tmp_path_factory, worker_id):
     """The root of a whole smoke study, made once for all of pytest's workers. Not to be changed."""
     base = tmp_path_factory.getbasetemp()
-    out = (base if worker_id == "master" else base.parent) / "study" / "runs"
+    shared = base if worker_id == "master" else base.parent
+    out = shared / "study" / "runs"
     out.parent.mkdir(exist_ok=True)
-    with open(out.parent / "lock", "w") as lock:
+    with open(shared / "study.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (out.parent / "done").exists():
+        if not (shared / "study.done").exists():
             for script in SCRIPTS:
                 run(out, script)
-            (out.parent / "done").touch()
+            (shared / "study.done").touch()
     return out
