@@ -144,7 +144,7 @@ def test_a_signal_stops_the_arm(robot, patient, monkeypatch, number, words, thre
     think, make = module.think, hardware.SimulatedArm.__init__
 
     def struck(f, pi, passes, row, memory):
-        if row.get("time", 0) > 0.3:
+        if "time" in row:  # from the first tick on: some runs have but three
             os.kill(os.getpid(), number), os.kill(os.getpid(), signal.SIGINT)  # the second changes nothing
         return think(f, pi, passes, row, memory)
 
