@@ -10,7 +10,7 @@ from pymunk._chipmunk_cffi import lib  # Chipmunk's setters, without the overhea
 
 from common import task
 
-SUB_STEPS = 6  # a control step; tests/test_env.py holds the physics that this number must meet
+SUB_STEPS = 6  # a control step; tests/test_simulator.py holds the physics that this number must meet
 ITERATIONS = 5
 SPACING = 10.0  # m between worlds, so that they never meet
 REST = 1e-4  # m/s: a slower box is at rest
