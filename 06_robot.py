@@ -22,7 +22,7 @@ import torch
 from common import belief, command, networks, observation, plots, ranks, runs, speed, statistics, symmetry, tables
 from common import task, weights
 from common.env import PushVectorEnv
-from common.files import UserError, save_json, write_atomic
+from common.files import UserError, claim, save_json, write_atomic
 from common.progress import bar
 from common.robot import controller, hardware, page, runlog, safety, scene, tags, views
 from common.task import World
@@ -221,14 +221,15 @@ def main(cfg):
     paths = {"estimator": runs.find(cfg, "03_train_estimator", "estimator.safetensors", "ours"),
              "policy": runs.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty")}
     f, pi = weights.load(networks.Estimator, paths["estimator"]), weights.load(networks.Recurrent, paths["policy"])
+    world = runs.world_of(cfg, paths.values())
     for name in ("box", "pusher_height", "max_force"):  # which tags, arm, pictures and program are made for
-        if (known := getattr(runs.world_of(cfg, paths.values()), name)) != getattr(World, name):
+        if (known := getattr(world, name)) != getattr(World, name):
             raise UserError(f"--{name.replace('_', '-')} {known}: the robot is made for {getattr(World, name)} only")
     folder = runs.run_folder(cfg.own, "06_robot", None, cfg.seed)
     scenarios = SCENARIOS if cfg.scenario == "all" else (cfg.scenario,)
     if cfg.force and any(runlog.read(folder, other) for other in SCENARIOS if other not in scenarios):
         raise UserError(f"--force redoes all scenarios of {folder}: say --scenario all, or another --seed")
-    runs.claim(folder)  # before anything touches an arm that another process may drive
+    claim(folder)  # before anything touches an arm that another process may drive
     # the first pass takes ten times as long as any other
     think(f, pi, cfg.passes, dict(seen=np.zeros(3), pusher=np.zeros(2), force=np.zeros(2), age=0), None)
     with contextlib.nullcontext() if cfg.view is None else page.Page(*cfg.view) as screen, connect(cfg) as arm:

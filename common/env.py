@@ -14,7 +14,6 @@ from common.simulator import DYNAMICS, SUB_STEPS, Worlds
 from common.task import World
 
 
-
 class PushVectorEnv(gym.vector.VectorEnv):
     """`num_envs` worlds in which a spherical pusher moves a box to the target at the workspace's centre.
 

@@ -14,7 +14,7 @@ import torch.distributed as dist
 RANK, COUNT, LOCAL, LOCAL_COUNT = (int(os.environ.get(name, default)) for name, default in (
     ("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0), ("LOCAL_WORLD_SIZE", 1)))  # of all machines; of this one
 PATIENCE = timedelta(days=1)  # the others wait while rank 0 draws; that a process has ended is noticed at once all the same
-groups = [None, None]  # one for each thread that calls collectives: on another rank theirs come in another order; 30 minutes
+groups = [None, None]  # one for each of two threads, whose collectives come in another order on another rank
 
 
 def begin(device):

@@ -147,7 +147,7 @@ class Run:
         inputs: paths of what the run reads, by any name.
         reads: names of the settings that it reads; none: all of the script's own. No other is recorded or compared.
         grows: inputs may come and change: then a finished run is open again.
-    Attribute world: world.World, that of the inputs.
+    Attribute world: task.World, that of the inputs.
     """
 
     def __init__(self, cfg: Stage, stage: str, inputs: dict[str, Path] = {}, method=None, reads=None, grows=False):

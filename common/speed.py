@@ -123,14 +123,14 @@ def set_gradient(loss, parts, draws, parameters):
     loss(*part, generator) needs every parameter; `draws` is the generator of the parts' seeds.
     Returns the loss (1,) and the number of valid steps.
     """
-    total = sum(part[-1].sum().item() for part in parts)
+    steps = [part[-1].sum().item() for part in parts]
 
-    def descent(part, seed):
-        value = loss(*part, torch.Generator(part[0].device).manual_seed(seed)) * (part[-1].sum().item() / total)
+    def descent(part, count, seed):
+        value = loss(*part, torch.Generator(part[0].device).manual_seed(seed)) * (count / sum(steps))
         return value.detach()[None], torch.autograd.grad(value, parameters)
 
     seeds = torch.randint(2**62, (len(parts),), generator=draws).tolist()
-    values, gradients = zip(*side_by_side(descent, parts, seeds))
+    values, gradients = zip(*side_by_side(descent, parts, steps, seeds))
     for parameter, *shares in zip(parameters, *gradients):
         parameter.grad = sum(shares)
-    return sum(values), total
+    return sum(values), sum(steps)

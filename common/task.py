@@ -44,26 +44,22 @@ def mean_distance(sides):
     return (2 * np.hypot(x, y) + x**2 / y * np.arcsinh(y / x) + y**2 / x * np.arcsinh(x / y)) / 6
 
 
-def since(default, before):
-    """A field that older runs do not know, whose code did `before`."""
-    return field(default=default, metadata={"before": before})
-
-
 @dataclass(frozen=True)
 class World:
-    """What is drawn for an episode, and from where; ranges are uniform. The defaults are the study's.
-
-    Raises ValueError: no such world.
+    """What is drawn for an episode, and from where; ranges are uniform. The defaults are the study's, and `before` is
+    what the code did in runs that do not know a field. Raises ValueError: no such world.
     """
 
-    starts: Literal[STARTS] = since("box", "inner")  # within the workspace: the box, its centre; inner: far from the borders
+    # within the workspace: the box, its centre; inner: far from the borders
+    starts: Literal[STARTS] = field(default="box", metadata={"before": "inner"})
     box: tuple[float, float, float] = (0.12, 0.10, 0.07)  # length, width, height in m (appendix A)
     mass: Range = (3.0, 3.5)  # of the box, kg (tab. dynamics_randomization)
     mu_static: Range = (0.3, 0.5)  # box on table, at least its mu_dynamic (tab. dynamics_randomization)
     mu_dynamic: Range = (0.1, 0.3)  # box on table (tab. dynamics_randomization)
     mu_pusher: Range = (0.1, 0.3)  # pusher on box; the paper's table has one row for all dynamic friction
     restitution: Range = (0.1, 0.7)  # pusher on box (tab. dynamics_randomization)
-    support: Range = since((0.0, 1.0), C_060)  # friction's c, from even pressure under the box (0) to all on its corners (1)
+    # friction's c, from even pressure under the box (0) to all on its corners (1)
+    support: Range = field(default=(0.0, 1.0), metadata={"before": C_060})
     support_offset: Range = (0.0, 0.0)  # distance of friction's centre from the box's in m, in a random direction
     pusher_height: float = 0.035  # of its centre above the table, m
     noise: tuple[float, float, float, float, float] = NOISE  # of a step: box x, y (m), theta (rad), force x, y (N)
@@ -108,9 +104,9 @@ class World:
 class Other(World):
     """A world with what no training knows, to evaluate in."""
 
-    late: int = 0  # steps by which the camera's frames are
-    gain: float = 1.0  # of the force sensor
-    surface: float = 2.0  # exponent of the limit surface; 2 is an ellipsoid
+    late: int = World.late  # steps by which the camera's frames are
+    gain: float = World.gain  # of the force sensor
+    surface: float = World.surface  # exponent of the limit surface; 2 is an ellipsoid
 
 
 BOX = np.array(World.box)  # the one that the robot's tags, arm and pictures are made for

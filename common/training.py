@@ -53,9 +53,9 @@ def held_out_success(env, actor, seed):
 
 def shares(hp):
     """This rank's numbers of worlds to train in and to measure in. Raises UserError: there are more processes than worlds."""
-    if min(hp.num_envs, hp.eval_episodes) < ranks.COUNT:
+    if (most := min(hp.num_envs, hp.eval_episodes)) < ranks.COUNT:
         raise UserError(f"{ranks.COUNT} processes share {hp.num_envs} worlds and {hp.eval_episodes} of --eval-episodes: start at "
-                        f"most {min(hp.num_envs, hp.eval_episodes)}")
+                        f"most {most}")
     return ranks.share(hp.num_envs), ranks.share(hp.eval_episodes)
 
 

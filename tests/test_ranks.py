@@ -15,7 +15,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 from common import command, networks, ppo, ranks, speed, stacks, training  # noqa: E402
-from tests.conftest import ROOT, SCRIPTS  # noqa: E402
+from conftest import ROOT, SCRIPTS, start  # noqa: E402
 
 HP = import_module("01_train_privileged").Config(
     num_envs=12, rollout_steps=20, minibatch=10**6, epochs=1, sizes=(16, 16, 16), grad_norm=1e9, updates=10, eval_every=5,
@@ -26,11 +26,6 @@ TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--np
 def torchrun(*words, count=2):
     return subprocess.Popen([*TORCHRUN, str(count), *map(str, words)], text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                             env=os.environ | {"OMP_NUM_THREADS": "1"})
-
-
-def alone(*words):
-    process = subprocess.run([sys.executable, *map(str, words)], text=True, capture_output=True)
-    return process.stdout, process.stderr, process.returncode
 
 
 def ends(process, code=0):
@@ -176,8 +171,8 @@ def test_killed_all_or_one_they_go_on_and_end_bit_for_bit_as_uninterrupted(tmp_p
     begin = time.monotonic()
     stderr = ends(torchrun(__file__, "mortal", "01_train_privileged", "smoke", "--out", tmp_path / "killed", "--updates", 16), 1)[1]
     assert time.monotonic() - begin < 60 and "Signal 9" in stderr
-    stdout, stderr, code = alone(ROOT / "01_train_privileged.py", "smoke", "--out", tmp_path / "killed", "--updates", 16)
-    assert code == 2 and "was begun with 2 processes, not 1: start as many, or use --force" in stderr
+    stderr = ends(start(tmp_path / "killed", SCRIPTS[0], "--updates", "16"), 2)[1]
+    assert "was begun with 2 processes, not 1: start as many, or use --force" in stderr
     ends(trained(tmp_path / "killed"))
     whole, killed = (tmp_path / name / here / "policy.safetensors" for name in ("whole", "killed"))
     assert whole.read_bytes() == killed.read_bytes()

@@ -6,11 +6,9 @@ import time
 
 import numpy as np
 
-from common import task
 from common.robot import ik
 from common.robot.safety import Stop
 
-STEPS = ik.QP_RATE // task.RATE  # QP steps a control step
 SILENCE = 0.1  # s without a new target, after which the arm is stopped
 
 
@@ -55,7 +53,7 @@ class Controller:
     def tick(self):
         """Returns at the end of the control step, and for how long that was waited, in s."""
         if not self.thread:
-            self._play(STEPS - self.late)
+            self._play(ik.STEPS - self.late)
             return 0.0
         began = time.perf_counter()
         self.arm.require(self.beat.wait(2 * SILENCE), "the control thread hangs")
@@ -87,7 +85,7 @@ class Controller:
                 while self.running:
                     self._play(1, wait)
                     steps += 1
-                    if steps % STEPS == 0:
+                    if steps % ik.STEPS == 0:
                         self.beat.set()
             except BaseException as error:
                 self.arm.fail(error)

@@ -110,13 +110,12 @@ class SimulatedArm:
             if geometry.nearest(box, self.points[-1])[0] > 0 and not task.outside(box, self.worlds.pusher[0]):
                 self.worlds.place(np.arange(1), box[None], self.worlds.pusher, {})
         self.worlds.step(ik.QP_RATE * (self.points[-1:, :2] - self.worlds.pusher))
-        if round(self.time * ik.QP_RATE) % (ik.QP_RATE // task.RATE) == 1:  # one draw a control step, and no mean makes it less
+        if round(self.time * ik.QP_RATE) % ik.STEPS == 1:  # one draw a control step, and no mean makes it less
             self.noise = self.rng.normal(0, self.gaps.force_noise, 3)
         self.remember()
 
     def stop(self):
         self.stopped, self.speeds = True, np.zeros(len(self.model.limits))
-
 
     def join(self, what, way=()):
         """Somebody "cover"s the tags for half a second, asks for the "next" run, or "nudge"s the box by (2,) m; any thread."""

@@ -15,7 +15,8 @@ from common import task
 
 warnings.filterwarnings("ignore", module="qpsolvers")  # what the solver says of a failure, solve returns
 
-QP_RATE = 150  # QP steps a second, ten a control step
+QP_RATE = 150  # QP steps a second
+STEPS = QP_RATE // task.RATE  # of a control step
 MARGIN = 0.010  # m, how far beyond the workspace the pusher may go
 WEIGHTS = np.array([1e4, 1e4, 1e2])  # of x, y (m/s) and yaw (rad/s): far above the posture's, which would leak into the path
 DAMPING, POSTURE_WEIGHT, POSTURE_GAIN = 1e-2, 1e-2, 0.2  # the gain in 1/s

@@ -72,7 +72,7 @@ class Guarded:
 
     def begin(self):
         """A run begins: what was read before does not count."""
-        self._joints, self._forces = deque(maxlen=ik.QP_RATE), deque(maxlen=ik.QP_RATE // task.RATE)  # a second's, a tick's
+        self._joints, self._forces = deque(maxlen=ik.QP_RATE), deque(maxlen=ik.STEPS)  # a second's, a tick's
         self._renewed, self._again, self._unsolved, self._equal, self._image = wall.monotonic(), 0, 0, 0, None
         self.read_joints(), self.read_wrench()
 
