@@ -76,12 +76,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
 
     def _start(self, worlds, **given):
         box, pusher = self._draw_start(len(worlds), given.pop("box", None), given.pop("pusher", None))
-        drawn = {name: self.np_random.uniform(*limits, len(worlds)) for name, limits in self.world.dynamics.items()}
-        polar = self.world.support_offset, (-np.pi, np.pi)
-        distance, angle = (self.np_random.uniform(*limits, len(worlds)) for limits in polar)
-        drawn |= {"support_x": distance * np.cos(angle), "support_y": distance * np.sin(angle)}
-        drawn["mu_static"] = np.maximum(drawn["mu_static"], (drawn | given)["mu_dynamic"])
-        self.worlds.place(worlds, box, pusher, drawn | given)
+        self.worlds.place(worlds, box, pusher, self.world.draw(self.np_random, len(worlds), given))
         self._steps[worlds] = 0
 
     def _given(self, options):

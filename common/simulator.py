@@ -118,8 +118,10 @@ class Worlds:
         """True states (N, 7): box, pusher, force in SI units."""
         return np.concatenate([self.box, self.pusher, self.force], 1)
 
-    def place(self, worlds, box, pusher, dynamics):
-        """Starts `worlds` (k,) anew at poses (k, 3) and (k, 2), at rest, with given dynamics ({name: (k,)})."""
+    def place(self, worlds, box, pusher, dynamics, twists=np.zeros((2, 1, 3)), force=np.zeros((1, 2))):
+        """Starts `worlds` (k,) anew at poses (k, 3) and (k, 2), with given dynamics ({name: (k,)}): at rest and apart, or with
+        the velocities (2, k, 3) and the force (k, 2) of the last step, so that a copy of a world goes on as that would.
+        """
         for name, value in dynamics.items():
             self.dynamics[name][worlds] = value
         mass, mu_static, mu_dynamic, mu_pusher, restitution, c, *support = (self.dynamics[name][worlds] for name in DYNAMICS)
@@ -132,13 +134,14 @@ class Worlds:
         _set_all(lib.cpShapeSetFriction, self._c_shapes[worlds], mu_pusher)
         _set_all(lib.cpShapeSetElasticity, self._c_shapes[worlds], restitution)
         self._rest[worlds] = False  # so that the next sub-step sets the new mass
-        self.box[worlds], self.pusher[worlds], self.force[worlds] = box, pusher, 0.0
+        self.box[worlds], self.pusher[worlds], self.force[worlds] = box, pusher, force
+        self._held[worlds], self._touched[worlds] = False, force.any(1)
         for i in worlds:  # nothing of the last episode stays: contacts keep their impulses, bodies a position correction
             lib.cpSpaceRemoveShape(self._c_spaces[i], self._c_shapes[i])
             lib.cpSpaceAddShape(self._c_spaces[i], self._c_shapes[i])
             lib.cpBodyUpdatePosition(self._c_boxes[i], 0.0)
-        for motion, pose in zip(self.motion, (box, pusher)):
-            motion[worlds] = 0.0
+        for motion, pose, twist in zip(self.motion, (box, pusher), twists):
+            motion[worlds, 2], motion[worlds, 3:] = 0.0, twist
             motion[worlds, :pose.shape[1]] = pose
             motion[worlds, :2] += self._origin[worlds]
         if self._eccentric:

@@ -60,7 +60,8 @@ class World:
     restitution: Range = (0.1, 0.7)  # pusher on box (tab. dynamics_randomization)
     # friction's c, from even pressure under the box (0) to all on its corners (1)
     support: Range = field(default=(0.0, 1.0), metadata={"before": C_060})
-    support_offset: Range = (0.0, 0.0)  # distance of friction's centre from the box's in m, in a random direction
+    # distance of friction's centre from the box's in m, in a random direction: a push at half height moves the pressure
+    support_offset: Range = field(default=(0.0, 0.008), metadata={"before": (0.0, 0.0)})
     pusher_height: float = 0.035  # of its centre above the table, m
     noise: tuple[float, float, float, float, float] = NOISE  # of a step: box x, y (m), theta (rad), force x, y (N)
     bias: tuple[float, float, float, float, float] = NOISE  # of an episode, likewise (tab. occlusion_and_noise_params)
@@ -92,6 +93,14 @@ class World:
         even, corners = mean_distance(self.box[:2]), np.linalg.norm(self.box[:2]) / 2
         return {name: getattr(self, name) for name in DRAWN} | {
             "limit_surface_c": tuple(even + share * (corners - even) for share in self.support)}
+
+    def draw(self, rng, count, given={}):
+        """Dynamics of `count` episodes, {name: (count,)} as simulator.Worlds takes them, around those that are given."""
+        drawn = {name: rng.uniform(*limits, count) for name, limits in self.dynamics.items()}
+        distance, angle = rng.uniform(*self.support_offset, count), rng.uniform(-np.pi, np.pi, count)
+        drawn |= {"support_x": distance * np.cos(angle), "support_y": distance * np.sin(angle)}
+        drawn["mu_static"] = np.maximum(drawn["mu_static"], (drawn | given)["mu_dynamic"])
+        return drawn | given
 
     def centre_range(self, angle):
         """Half widths (N, 2) in m of the rectangle about the target in which the centres of boxes at angles (N,) start."""

@@ -16,6 +16,7 @@ from common.files import UserError, save_json, save_tensors
 from common.task import C_060, World
 
 ROOT = Path(__file__).parent.parent
+BEFORE = World("inner", support=C_060, support_offset=(0.0, 0.0))
 PUBLISHED = [path.parent.relative_to(ROOT / "pretrained") for path in sorted((ROOT / "pretrained").rglob("config.json"))]
 
 
@@ -88,7 +89,7 @@ def test_every_published_run_has_the_settings_of_its_preset(folder, tmp_path):
     module = importlib.import_module(stage)
     options = ["--method", *method] * bool(method) + ["--seed", seed[4:], "--out", str(tmp_path)]
     if stage.startswith("01"):  # their world
-        options += ["--starts", "inner", "--support", *map(repr, C_060)]
+        options += ["--starts", "inner", "--support", *map(repr, C_060), "--support-offset", "0", "0"]
     cfg = command.parse(module.Config, module.PRESETS, "", ["laptop", *options])
     reads = module.settings_of(cfg) if stage.startswith("04") else None
     written = runs.record_of(cfg, tmp_path / "laptop" / folder)
@@ -124,9 +125,9 @@ def test_inputs_of_two_worlds_are_one_line(config, tmp_path):
 def test_a_run_of_before_the_world_is_known_by_its_world(config, tmp_path):
     cfg = Worldly(preset="quick", out=tmp_path / "runs")
     path = make(cfg, "01_a", 1)
-    record(path, starts=None, support=None)
+    record(path, starts=None, support=None, support_offset=None)
     old = runs.Run(config(), "02_b", {"a": path}).world
-    assert old == World("inner", support=C_060) and old.dynamics["limit_surface_c"] == (0.060, 0.060)
+    assert old == BEFORE and old.dynamics["limit_surface_c"] == (0.060, 0.060)
     with pytest.raises(UserError, match="starts inner -> box, support "):
         runs.Run(cfg, "01_a")
 
@@ -134,7 +135,7 @@ def test_a_run_of_before_the_world_is_known_by_its_world(config, tmp_path):
 @pytest.mark.parametrize("folder", PUBLISHED, ids=str)
 def test_published_nets_are_of_the_world_of_before(folder):
     record = json.loads((ROOT / "pretrained" / folder / "config.json").read_text())
-    assert World.of(record["settings"] | record.get("world", {})) == World("inner", support=C_060)
+    assert World.of(record["settings"] | record.get("world", {})) == BEFORE
 
 
 # Weights from elsewhere

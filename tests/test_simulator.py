@@ -12,7 +12,8 @@ G = task.GRAVITY
 HALF_BOX = np.array(World.box[:2]) / 2
 GYRATION = (0.12**2 + 0.10**2) / 12  # m^2, moment of inertia / mass
 REST = 5  # the bin of zero velocity
-MIDDLE = {"mass": 3.25, "mu_static": 0.4, "mu_dynamic": 0.2, "mu_pusher": 0.2, "restitution": 0.4, "limit_surface_c": 0.060}
+MIDDLE = {"mass": 3.25, "mu_static": 0.4, "mu_dynamic": 0.2, "mu_pusher": 0.2, "restitution": 0.4, "limit_surface_c": 0.060,
+          "support_x": 0.0, "support_y": 0.0}
 RANGES = {"mass": (3.0, 3.5), "mu_static": (0.3, 0.5), "mu_dynamic": (0.1, 0.3), "mu_pusher": (0.1, 0.3),
           "restitution": (0.1, 0.7), "limit_surface_c": (0.04219, 0.07811)}
 OTHER = World(box=(0.14, 0.08, 0.05), mass=(1.0, 2.0), mu_static=(0.2, 0.5), mu_dynamic=(0.3, 0.6), support=(0.5, 0.5))
@@ -170,7 +171,7 @@ def test_a_box_spins_about_its_centre_of_friction():
     play(env, REST, 30)
     moved = env.box[0, :2] + geometry.rotation(env.box[0, 2]) @ [0.02, -0.01]
     assert moved == pytest.approx([0.1, 0] + geometry.rotation(0.3) @ [0.02, -0.01], abs=1e-9) and env.box[0, 2] > 0.6
-    env.reset(options=MIDDLE | {"box": [0.1, 0, 0.3], "pusher": [-0.1, 0], "support_x": 0.0, "support_y": 0.0, "mu_dynamic": 0.15})
+    env.reset(options=MIDDLE | {"box": [0.1, 0, 0.3], "pusher": [-0.1, 0], "mu_dynamic": 0.15})
     launch(env, (0, 0), 8.0)
     play(env, REST, 30)
     assert env.box[0, :2] == pytest.approx([0.1, 0], abs=1e-9)  # nothing of it stays
@@ -279,7 +280,7 @@ def test_no_history_in_a_world_that_starts_anew():
     used = start(40, **(options | {"box": rng.uniform(-0.002, 0.002, (40, 3))}))
     play(used, action, 12)
     assert (used.force != 0).any(1).mean() > 0.8
-    used.reset(seed=0, options={"box": [0, 0, 0]} | options)
+    used.reset(seed=0, options={"box": [0, 0, 0]} | MIDDLE | options)
     fresh = start(40, **options)
     assert play(used, action, 15) == pytest.approx(play(fresh, action, 15), abs=1e-9)
 
