@@ -12,9 +12,9 @@ from typing import Literal
 
 import torch
 
-from common import command, networks, plots, ranks, runs, speed, statistics, supervised, trajectories, weights
+from common import calibration, command, networks, plots, ranks, runs, speed, statistics, supervised, trajectories, weights
 from common.files import UserError, save_json
-from common.stacks import ESTIMATORS
+from common.stacks import TRAINED
 
 STRIDE = 3  # the loss is taken at every third step: neighbours say the same, and the head costs as much as the LSTM
 GRID = (1, 2, 5, 10, 20, 50)  # of M, for the error against M
@@ -22,7 +22,7 @@ GRID = (1, 2, 5, 10, 20, 50)  # of M, for the error against M
 
 @dataclass
 class Config(command.Reader):
-    method: Literal[(*ESTIMATORS, "all")] = "all"  # ours: MC dropout; likelihood, mse: none (tab. estimator_ablation)
+    method: Literal[(*TRAINED, "all")] = "all"  # ours: MC dropout; likelihood, mse: none (tab. estimator_ablation)
     sizes: tuple[int, int, int] = (1024, 512, 256)  # LSTM and two linear layers (sec. 4)
     dropout: float = 0.2  # probability before every linear layer, of ours (sec. 4)
     sequences: int = 100  # trajectories per mini-batch: 30,000 steps, 300 each (tab. estimator_hyperparameters)
@@ -44,7 +44,7 @@ PRESETS = {
 def train(run, cfg, train_set, validation_set, device):
     """f with eq. 1 or the mean squared error of one stochastic pass; False when the time limit stopped it."""
     torch.manual_seed(cfg.seed)
-    kind = ESTIMATORS[cfg.method]
+    kind = TRAINED[cfg.method]
     f = networks.Estimator(cfg.sizes, cfg.dropout if kind.dropout else 0.0, kind.likelihood).to(device)
 
     def loss(o, s, mask, generator):
@@ -61,36 +61,39 @@ def train(run, cfg, train_set, validation_set, device):
         validation=cfg.validation)
 
 
-def error_against_passes(estimator, data, cfg, device, world):
-    """Errors on the validation set for each M of GRID; without dropout for M = 1, as every pass is the same."""
+def against_passes(estimator, data, cfg, device, world):
+    """{M: sums of trajectories.measure} on the validation set; without dropout for M = 1, as every pass is the same."""
     def sums(m):
         def predict(o):
-            return estimator.predict(o, passes=m)[0]
+            return estimator.predict(o, passes=m)[:2]
 
         return trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, predict, world)
 
-    done = {m: sums(m) for m in (GRID if estimator.dropout else (1,))}
-    return {m: statistics.error_table(measured) for m, measured in done.items() if measured}
+    return {m: sums(m) for m in (GRID if estimator.dropout else (1,))}
 
 
 def main(cfg):
     if not 0 <= cfg.dropout < 1:
         raise UserError(f"--dropout {cfg.dropout}: at least 0 and below 1")
     device = command.device_of(cfg)
-    for method in ESTIMATORS if cfg.method == "all" else [cfg.method]:
+    for method in TRAINED if cfg.method == "all" else [cfg.method]:
         cfg = replace(cfg, method=method)
         train_set, paths = trajectories.load_set(cfg, "train")
         validation_set, validation_paths = trajectories.load_set(cfg, "validation")
-        reads = {field.name for field in fields(cfg)} - ({"dropout"} if not ESTIMATORS[method].dropout else set())
+        reads = {field.name for field in fields(cfg)} - ({"dropout"} if not TRAINED[method].dropout else set())
         run = runs.Run(cfg, "03_train_estimator", paths | validation_paths, method, reads)
         if run.skip():
             continue
         if not train(run, cfg, train_set, validation_set, device):
             return
         estimator = weights.load(networks.Estimator, run.dir / "estimator.safetensors", device)
-        errors = error_against_passes(estimator, validation_set, cfg, device, run.world)
+        measured = against_passes(estimator, validation_set, cfg, device, run.world)
         if ranks.RANK:
             continue
+        if told := measured[max(measured)].get("calibration"):
+            estimator.scale = calibration.scale(told)
+            weights.save(run.dir / "estimator.safetensors", estimator)
+        errors = {m: statistics.error_table(sums) for m, sums in measured.items()}
         save_json(run.dir / "passes.json", errors)
         if len(errors) > 1:
             plots.passes(errors, run.dir / "passes.png")

@@ -5,7 +5,7 @@
 
 Reads pi_priv (01), the teacher sets (02) and the estimators (03): those in the folder --weights, and the others of the same
 preset. Writes runs/<preset>/04_train_policy/<method>/seed<k>/: policy.safetensors, metrics.csv, training.png, and
-success_rate.png of all methods and seeds or bc_loss.png. Without --method all are trained in turn.
+success_rate.png of all methods and seeds or bc_loss.png. Without --method all of the paper's are trained in turn.
 """
 from dataclasses import dataclass, fields, replace
 from typing import Literal
@@ -80,7 +80,7 @@ def inputs_of(cfg):
     if cfg.warm_start and (sizes := weights.load(networks.Recurrent, paths["policy"]).sizes) != cfg.sizes:
         raise UserError(f"--sizes {cfg.sizes}: pi_priv has {sizes}; use those, or --no-warm-start")
     if kind := TRAINED[cfg.method].estimator:
-        paths["estimator"] = runs.find(cfg, "03_train_estimator", "estimator.safetensors", kind)
+        paths |= {f"estimator{i or ''}": path for i, path in enumerate(stacks.find_estimator(cfg, kind))}
     return paths or nets("policy")  # what reads no net has pi_priv's world all the same
 
 
@@ -95,7 +95,8 @@ def start_from(net, trained, first=0):
 def train_rl(run, cfg, paths, device):
     """Recurrent PPO on the method's stack (sec. 3.3). Returns the policy, None when the time limit stopped it."""
     method = TRAINED[cfg.method]
-    estimator = weights.load(networks.Estimator, paths["estimator"], device) if method.estimator else None
+    nets = [path for name, path in paths.items() if name.startswith("estimator")]
+    estimator = stacks.load_estimator(method.estimator, nets, device) if nets else None
     worlds, measured = training.shares(cfg)
     env = stacks.make(method, worlds, estimator, cfg.passes, privileged=cfg.privileged_critic, world=run.world)
     held_out = stacks.make(method, measured, estimator, cfg.passes, world=run.world)
@@ -136,7 +137,7 @@ def train_bc(run, cfg, paths, device):
 
 def main(cfg):
     device = command.device_of(cfg)
-    for method in TRAINED if cfg.method == "all" else [cfg.method]:
+    for method in [name for name, m in TRAINED.items() if m.published] if cfg.method == "all" else [cfg.method]:
         cfg, cloning = replace(cfg, method=method), TRAINED[method].training == "cloning"
         paths = inputs_of(cfg)
         run = runs.Run(cfg, "04_train_policy", paths, method, settings_of(cfg))

@@ -6,8 +6,8 @@ Reads pi_priv (01), the test set (02), the estimators (03), every finished seed 
 all: those in the folder --weights, which is pretrained/ with the preset pretrained, and the others of the same preset. Writes
 runs/<preset>/05_evaluate/seed<k>/: results.json, tables.md, film.mp4, film.gif, and as PNG the figures of sec. 5 and of the
 appendix: success_rate, occlusion_duration, trajectory_with_uncertainty, sim, success_rate_priv, likelihood_loss, mse_loss,
-bc_loss; and other_worlds. What is not trained is left out; after a further training the same command measures what is new,
-and no more (measurements.json). Resumes after the last finished measurement.
+bc_loss; other_worlds, calibration. What is not trained is left out; after a further training the same command measures what
+is new, and no more (measurements.json). Resumes after the last finished measurement.
 """
 import hashlib
 import math
@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from common import command, film, plots, ranks, runs, statistics, tables, task, trajectories
+from common import command, film, plots, ranks, runs, stacks, statistics, tables, task, trajectories
 from common.files import load_json, save_json, write_atomic
-from common.measurements import Measurement, measurements
+from common.measurements import FILTERED, Measurement, measurements
 from common.players import LIST, Players
 from common.progress import bar
-from common.stacks import ESTIMATORS, METHODS
+from common.stacks import ESTIMATORS, METHODS, TRAINED
 
 
 @dataclass
@@ -32,6 +32,9 @@ class Config(command.Reader):
     switch_episodes: int = 20_000  # episodes for the contact switches (sec. 5.4)
     passes: int = 50  # M, stochastic passes of the estimator in the loop (sec. 4)
     other_episodes: int | None = 1000  # episodes for each policy in each of the other worlds; none: these are left out
+    # trajectories of each kind for the particle filter, half of its episodes in the loop; none: it is left out
+    filter_trajectories: int | None = command.setting(100, before=None)
+    particles: int = 1000  # of the filter
     test: int = 150_000  # most trajectories of the test set (appendix B.2)
     test_passes: int = 50  # M on the test set
     num_envs: int = 2000  # worlds at once: so many episodes of the list share a seed, so another number is another list
@@ -39,17 +42,19 @@ class Config(command.Reader):
 
 PRESETS = {
     "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, other_episodes=100, passes=10, num_envs=200,
+                       filter_trajectories=None,
                        weights=Path(__file__).parent / "pretrained"),
     "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, other_episodes=None, passes=2, test=12,
-                  num_envs=16),
-    "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, other_episodes=300, passes=20, test=2000, num_envs=300),
+                  num_envs=16, filter_trajectories=2, particles=20),
+    "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, other_episodes=300, passes=20, test=2000, num_envs=300,
+                  filter_trajectories=20, particles=300),
     "laptop": dict(switch_episodes=2000, passes=10, num_envs=1000),
     "paper": {},
 }
 
 
 def trained(cfg):
-    """What is there to measure, and names of what is not: {kind: path}, {(method, seed): path}, [name].
+    """What is there to measure, and names of what is not: {kind: [path]}, {(method, seed): path}, [name].
 
     Raises UserError: pi_priv is missing, or something is damaged or stale.
     """
@@ -57,9 +62,9 @@ def trained(cfg):
     estimators, policies, left_out = {}, {}, []
     for kind in reversed(ESTIMATORS):  # the order of tab. estimator_ablation
         try:
-            estimators[kind] = runs.find(cfg, "03_train_estimator", "estimator.safetensors", kind)
+            estimators[kind] = stacks.find_estimator(cfg, kind)
         except runs.Missing:
-            left_out.append(f"estimator {kind}")
+            left_out += [f"estimator {kind}"] if kind in TRAINED else []
     for name, method in METHODS.items():
         stage, folder = ("01_train_privileged", None) if method.training == "pi_priv" else ("04_train_policy", name)
         for k in sorted({0, *runs.seeds(cfg.roots, stage, folder)}):
@@ -68,21 +73,31 @@ def trained(cfg):
                 path = runs.find(cfg, stage, "policy.safetensors", folder, k)
                 if method.estimator not in (None, *estimators) or k and (name, 0) not in policies:
                     raise runs.Missing
-                runs.check_lineage(cfg, path.parent, runs.hashes_of(cfg, [pi_priv, *estimators.values(), path]))
+                runs.check_lineage(cfg, path.parent, runs.hashes_of(cfg, [pi_priv, *sum(estimators.values(), []), path]))
                 policies[name, k] = path
             except runs.Missing:
-                left_out.append(label)
+                left_out += [label] if method.published else []
             except runs.Mixed:
                 left_out.append(f"{label} (on other nets than these)")
     return estimators, policies, left_out
 
 
-def estimator_errors(cfg, players, test, kind):
-    """Row of tab. estimator_ablation on the test set; vision is the pose in o, held when occluded."""
-    def predict(o):
-        return o[..., :4] if kind == "vision" else players.estimator(kind).predict(o, passes=cfg.test_passes)[0]
+def estimator_errors(cfg, players, test, name):
+    """Row of tab. estimator_ablation on the test set, or of the filter's table; vision is the pose in o, held when occluded."""
+    section, *row, kind = name.split("/")
+    data, limit, size = test, cfg.test, 100
+    if section == "filter":
+        data, limit, size = test if row == ["test"] else players.unsure(*row), cfg.filter_trajectories, 1
+    estimator = players.estimator(None if kind == "vision" else kind)
+    progress = bar(min(limit, len(data[1]) - 1), name, unit="trajectory")
 
-    sums = trajectories.measure(test, cfg.test, 100, LIST + cfg.seed, players.device, predict, players.world)
+    def predict(o):
+        progress.update(o.shape[1])
+        return estimator.predict(o, passes=cfg.test_passes)[:2] if estimator else (o[..., :4], None)
+
+    sums = trajectories.measure(data, limit, size, LIST + cfg.seed, players.device, predict, players.world,
+                                getattr(estimator, "scale", None))
+    progress.close()
     return statistics.error_table(sums) if sums else None
 
 
@@ -96,11 +111,11 @@ def measure(run, players, todo, test, keys, kept):
         save_json(run.dir / "measurements.json", kept, indent=None)
 
     for name in [name for name, key in keys.items() if name not in todo and key not in kept]:
-        ranks.lead(keep)(name, estimator_errors(run.cfg, players, test, name.partition("/")[2]))
+        ranks.lead(keep)(name, estimator_errors(run.cfg, players, test, name))
         if run.out_of_time():
             return False
-    new, width = {name: m for name, m in todo.items() if keys[name] not in kept}, run.cfg.num_envs
-    chunks = [(name, number) for name, m in new.items() for number in range(math.ceil(m.episodes / width))]
+    new = {name: m for name, m in todo.items() if keys[name] not in kept}
+    chunks = [(name, number) for name, m in new.items() for number in range(math.ceil(m.episodes / m.width(run.cfg)))]
     total, ahead = (sum(m.episodes for m in several.values()) for several in (todo, new))
     progress, values = bar(total, "05_evaluate", unit="episode", initial=total - ahead), defaultdict(list)
     for jobs in trajectories.batches(chunks, ranks.COUNT):
@@ -139,6 +154,7 @@ def draw(run, players, results, done):
         if {*methods} & {*results["estimator_ablation"], *results["success_rate"]}:
             plots.validation_loss(cfg.roots, name, run.dir / f"{name}.png")
     plots.sim(run.dir / "sim.png", players.world)
+    plots.calibration(results, run.dir / "calibration.png")
     if results["other_worlds"]:
         plots.other_worlds(results, run.dir / "other_worlds.png")
     if results["occlusion_duration"]:
@@ -167,15 +183,20 @@ def main(cfg):
     device = command.device_of(cfg)
     estimators, policies, left_out = trained(cfg)
     test, test_paths = trajectories.load_set(cfg, "test")
-    paths = estimators | policies
-    run = runs.Run(cfg, "05_evaluate", paths | test_paths, grows=True)
+    paths, nets = estimators | policies, {(kind, i): path for kind in estimators for i, path in enumerate(estimators[kind])}
+    run = runs.Run(cfg, "05_evaluate", nets | policies | test_paths, grows=True)
     if left_out:
         print(f"left out, as not trained to the end: {'; '.join(left_out)}")
     players, todo = Players(cfg, paths, device, run.world), measurements(cfg, policies, run.world)
-    sha = {name: next(iter(runs.hashes_of(cfg, [path]).values())) for name, path in (paths | test_paths).items()}
-    sources = {f"estimator_ablation/{kind}": [*(sha[name] for name in test_paths), sha.get(kind)]
-               for kind in ("vision", *estimators)}
-    sources |= {name: [sha[m.method, m.seed], sha.get(METHODS[m.method].estimator)] for name, m in todo.items()}
+    def sha(*paths):
+        return [*runs.hashes_of(cfg, paths).values()]
+
+    pi_priv, tested = policies["priv_on_state", 0], [kind for kind in estimators if not ESTIMATORS[kind].scaled]
+    sources = {f"estimator_ablation/{kind}": sha(*test_paths.values(), *estimators.get(kind, ())) for kind in ("vision", *tested)}
+    sources |= {f"filter/{row}/{kind}": sha(*test_paths.values(), pi_priv, *estimators.get(kind, ()))
+                for row in ("test", "drifting", *FILTERED) if cfg.filter_trajectories for kind in ("vision", *tested, "filter")}
+    sources |= {name: sha(policies[m.method, m.seed], *estimators.get(METHODS[m.method].estimator, ()))
+                for name, m in todo.items()}
     keys = {name: f"{name} {hashlib.sha256(repr(files).encode()).hexdigest()[:16]}" for name, files in sources.items()}
     kept = ranks.lead(load_json)(run.dir / "measurements.json", "delete it, and the same command measures anew") or {}
     if run.finished and set(keys.values()) <= kept.keys() and ranks.lead((run.dir / "results.json").exists)():

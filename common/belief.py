@@ -13,7 +13,7 @@ def believe(estimator, o, hidden, passes):
     A belief is s_hat = (q_hat, pusher, noisy force), without xi, and the four standard deviations sqrt(diag Sigma) in scaled
     units, clipped to [0, 1] (appendix B.1).
     """
-    device = next(estimator.parameters()).device
+    device = next(estimator.parameters(), torch.empty(0)).device  # a filter has none
     with autocast(device):
         q, variance, hidden = estimator.predict(torch.as_tensor(o, device=device)[None], hidden, passes)
     sigma = variance[0].sqrt().clamp(max=1.0)

@@ -7,6 +7,7 @@ from common.stacks import METHODS
 from common.task import C_060, STARTS, Other, World
 
 DURATIONS = {"0": 0.0, "2.5": 2.5, "5": 5.0, "10": 10.0, "full": math.inf}  # s; the paper's own grid is in its plot only
+FILTERED = ("c=0.042", "c=0.078", "support_offset=8mm")  # other worlds in which the particle filter is measured
 SENSING = ("noise", "bias", "gain", "late")  # of a world, what only an observation knows
 
 
@@ -22,6 +23,12 @@ class Measurement:
     greedy: bool = True
     switches: bool = False
     errors: bool = False
+    filtered: bool = False  # the particle filter is in the loop
+    worlds: int | None = None  # at once; none: as many as the setting says
+
+    def width(self, cfg):
+        """Episodes of a chunk."""
+        return self.worlds or cfg.num_envs
 
 
 def measurements(cfg, policies, world):
@@ -38,6 +45,9 @@ def measurements(cfg, policies, world):
              for row, other in (other_worlds(world).items() if cfg.other_episodes else ()) for m in methods
              if METHODS[m].estimator or METHODS[m].reads == "s" and not of_sensing(other, world)}
     todo |= {f"in_the_loop/{m}": Measurement(m, cfg.episodes, errors=True) for m in methods if METHODS[m].estimator}
+    todo |= {f"filter_loop/{m}/{name}": Measurement(m, 2 * cfg.filter_trajectories, filtered=name == "filter", worlds=1)
+             for m in ("est_uncertainty", "priv_on_estimate") if m in methods and cfg.filter_trajectories
+             for name in ("ours", "filter")}
     if "est_uncertainty" in methods:
         todo["sampled_actions/est_uncertainty"] = Measurement("est_uncertainty", cfg.episodes, greedy=False)
     return todo

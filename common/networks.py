@@ -75,12 +75,13 @@ class Estimator(nn.Module):
     """f: LSTM 1024, then linear 512, 256, 8 with tanh and dropout before every linear layer (sec. 4).
 
     `sizes` are those of the LSTM and the two hidden linear layers. Without `likelihood` it predicts the pose alone (4 outputs,
-    MSE), not its log-variances too. The variants without MC dropout have the probability 0.
+    MSE), not its log-variances too. The variants without MC dropout have the probability 0. `scale`, if known,
+    are factors on its four standard deviations that fit the validation set best; only an Ensemble applies them.
     """
 
-    def __init__(self, sizes=(1024, 512, 256), dropout=0.2, likelihood=True):
+    def __init__(self, sizes=(1024, 512, 256), dropout=0.2, likelihood=True, scale=None):
         super().__init__()
-        self.sizes, self.dropout, self.likelihood = tuple(sizes), dropout, likelihood
+        self.sizes, self.dropout, self.likelihood, self.scale = tuple(sizes), dropout, likelihood, scale
         self.lstm = speed.EvenLSTM(9, sizes[0])
         nn.init.ones_(self.lstm.bias_ih_l0[sizes[0]:2 * sizes[0]])  # the forget gates begin open
         widths = (*sizes, 8 if likelihood else 4)
@@ -113,6 +114,22 @@ def predictive(q, log_var):
     mean = q.mean(0)
     sigma_epi2 = (q - mean).square().mean(0)
     return mean, sigma_epi2 if log_var is None else log_var.exp().mean(0) + sigma_epi2
+
+
+class Ensemble(nn.Module):
+    """Estimators as one: eqs. 3 and 4 over `nets` instead of passes (Lakshminarayanan et al. 2017); `scaled`: by their scales."""
+
+    def __init__(self, nets, scaled=False):
+        super().__init__()
+        self.nets, self.scaled = nn.ModuleList(nets), scaled
+
+    def predict(self, o, hidden=None, passes=50):
+        """As Estimator.predict; the hidden state is that of all nets, one behind the other."""
+        each = [hidden and hidden[2 * i:2 * i + 2] for i in range(len(self.nets))]
+        q, variance, hidden = zip(*(net.predict(o, own, passes) for net, own in zip(self.nets, each)))
+        if self.scaled:
+            variance = [v * v.new_tensor(net.scale).square() for v, net in zip(variance, self.nets)]
+        return *predictive(torch.stack(q), torch.stack([*variance]).log()), sum(hidden, ())
 
 
 def nll(q, log_var, target, mask):

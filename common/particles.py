@@ -1,5 +1,6 @@
 """A particle filter whose particles are worlds of the study's simulator: an estimator that knows the physics, for reference."""
 import numpy as np
+import torch
 
 from common import task
 from common.simulator import Worlds
@@ -91,6 +92,23 @@ class Filter:
 
     def _told(self):
         """Mean and variance (4,) of x, y, sin and cos, scaled."""
-        q, weights = task.scale(np.concatenate([self.worlds.box, self.worlds.pusher, self.worlds.force], 1))[:, :4], self._weights()
+        q, weights = task.scale(self.worlds.state)[:, :4], self._weights()
         mean = weights @ q
         return mean, weights @ np.square(q - mean)
+
+
+class Filters:
+    """A Filter a trajectory, in the place of an estimator."""
+
+    def __init__(self, num, world=task.World()):
+        self.num, self.world = num, world
+
+    def parameters(self):
+        return iter(())
+
+    def predict(self, o, hidden=None, passes=None):
+        """As networks.Estimator.predict; the hidden state is the filters."""
+        filters = hidden or [Filter(self.num, self.world) for _ in range(o.shape[1])]
+        told = [[f.step(x) if hidden or t else f.begin(x) for f, x in zip(filters, row)]
+                for t, row in enumerate(o.cpu().numpy())]
+        return *torch.as_tensor(np.array(told), dtype=torch.float32).unbind(2), filters

@@ -1,9 +1,10 @@
 """Players of the fixed list of episodes: a policy with what is in its loop, in one kind of world (sec. 5)."""
 from functools import cache
 
+import numpy as np
 import torch
 
-from common import episodes, film, geometry, networks, stacks, trajectories, weights
+from common import collection, episodes, film, geometry, measurements, networks, particles, stacks, trajectories, weights
 from common.stacks import METHODS
 from common.task import World
 
@@ -14,17 +15,23 @@ class Players:
     """Plays Measurements with the nets at `paths`, a chunk of cfg.num_envs episodes of the fixed list at a time."""
 
     def __init__(self, cfg, paths, device, world=World()):
-        self.cfg, self.device, self.world = cfg, device, world
+        self.cfg, self.paths, self.device, self.world = cfg, paths, device, world
         self.policy = cache(lambda m, seed: weights.load(networks.Recurrent, paths[m, seed], device))
-        self.estimator = cache(lambda kind: weights.load(networks.Estimator, paths[kind], device) if kind else None)
+        self.estimator, self.unsure = cache(self.estimator), cache(self.unsure)
+
+    def estimator(self, kind):
+        """Of none, none; "filter" is the particle filter."""
+        if kind == "filter":
+            return particles.Filters(self.cfg.particles, self.world)
+        return stacks.load_estimator(kind, self.paths[kind], self.device) if kind else None
 
     def chunk(self, m, number):
         """Success (N,), length (N,) and film.Recorded of a chunk: starts, dynamics, noise, occlusions as for all."""
         seed = LIST * (1 + self.cfg.seed) + number
         torch.manual_seed(seed)
         method = METHODS[m.method]
-        estimator = self.estimator(method.estimator)
-        num, world = min(m.episodes, self.cfg.num_envs), m.world or self.world
+        estimator = self.estimator("filter" if m.filtered else method.estimator)
+        num, world = min(m.episodes, m.width(self.cfg)), m.world or self.world
         env = film.Recorded(stacks.make(method, num, estimator, self.cfg.passes, m.occlusion, world=world))
         return *episodes.play(env, self.policy(m.method, m.seed), seed, m.greedy), env
 
@@ -35,8 +42,16 @@ class Players:
         if m.switches:
             told = [geometry.contact_switches(env.episode(i, n)["state"], self.world.box) for i, n in enumerate(length)]
         if m.errors:
-            told = trajectories.in_the_loop(env.rows, length).tolist()
-        return told[:m.episodes - number * self.cfg.num_envs]
+            scale = getattr(self.estimator(METHODS[m.method].estimator), "scale", None)
+            told = trajectories.in_the_loop(env.rows, length, success, scale)
+        return told[:m.episodes - number * m.width(self.cfg)]
+
+    def unsure(self, row):
+        """Trajectories of pi_priv on drifting poses, in one of `other_worlds` or, as "drifting", in the nets'."""
+        world = measurements.other_worlds(self.world).get(row, self.world)
+        count, seed = self.cfg.filter_trajectories, LIST * (1 + self.cfg.seed)
+        states, length, _ = collection.collect(self.policy("priv_on_state", 0), world, count, seed, count)
+        return states, np.concatenate([[0], length]).cumsum()
 
     def episode(self, m, index):
         """Episode `index` of the list: states, observations, beliefs and success."""

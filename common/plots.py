@@ -18,7 +18,8 @@ matplotlib.rcParams.update({
     "savefig.dpi": 150})
 
 # Okabe and Ito's colours, told apart by the colour-blind, in the order of the registry: the same in every figure
-COLOURS = ("#0072B2", "#56B4E9", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#444444", "#B8A100", "#7A4FBF", "#8C564B")
+COLOURS = ("#0072B2", "#56B4E9", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#444444", "#B8A100", "#7A4FBF", "#8C564B",
+           "#332288", "#117733", "#882255")
 SUCCESS_AXIS = {"ylabel": "success rate (%)", "ylim": (-2, 102)}  # the y axis of success rates
 LOSSES = {  # figure: stage, methods, what is on the y axis
     "likelihood_loss": ("03_train_estimator", [m for m, kind in ESTIMATORS.items() if kind.likelihood], "loss (eq. 1)"),
@@ -29,7 +30,7 @@ LOSSES = {  # figure: stage, methods, what is on the y axis
 def style(name):
     """Label, colour and marker of a method or estimator."""
     registry = METHODS if name in METHODS else ESTIMATORS
-    styles = dict(zip(registry, zip(cycle(COLOURS), cycle("os^DvPX*<>"))))
+    styles = dict(zip(registry, zip(cycle(COLOURS), cycle("os^DvPX*<>hpd8"))))
     return registry[name].label, *styles[name]
 
 
@@ -183,6 +184,32 @@ def other_worlds(results, path):
     ax.set_yticks(range(len(rows)), rows)
     ax.set(xlabel=SUCCESS_AXIS["ylabel"], xlim=SUCCESS_AXIS["ylim"], ylim=(len(rows) - 0.5, -0.5))
     figure.legend(loc="outside upper center", ncols=3)
+    write_atomic(path, figure.savefig)
+
+
+def calibration(results, path):
+    """Is sigma true? On the test set, and in the loop of est_uncertainty: coverage of central intervals, error against sigma,
+    NEES after the last sight.
+    """
+    told = {style(kind)[:2]: e["calibration"] for kind, e in results["estimator_ablation"].items() if "calibration" in e}
+    if loop := results.get("in_the_loop", {}).get("est_uncertainty"):
+        told["ours, in the loop", "0.3"] = loop["calibration"]
+    figure, (curve, errors, nees) = new(11, 3.7, 1, 3)
+    for (label, color), c in told.items():
+        levels = [0, *map(float, c["curve"]), 1]
+        curve.plot(levels, [0, *(np.mean(shares) for shares in c["curve"].values()), 1], "o-", ms=4, color=color, label=label)
+        enough = np.array(c["steps"]) >= 100
+        errors.plot(np.array(c["sigma_mm"])[enough], np.array(c["rmse_mm"])[enough], "o-", ms=4, color=color)
+        nees.plot(c["nees"]["mean"], color=color)
+        nees.fill_between(range(len(c["nees"]["mean"])), c["nees"]["low"], c["nees"]["high"], color=color, alpha=0.2, lw=0)
+    limits = errors.get_xlim()
+    for ax, line in ((curve, (0, 1)), (errors, limits)):
+        ax.plot(line, line, color="0.5", lw=1, ls=":")
+    nees.axhline(1, color="0.5", lw=1, ls=":")
+    curve.set(xlabel="central interval of the predicted Gaussian", ylabel="share of x, y, theta within")
+    errors.set(xlabel="sigma in x, y (mm)", ylabel="root mean square error (mm)", xscale="log", yscale="log")
+    nees.set(xlabel="time since the box was last seen (s)", ylabel="NEES / 3", yscale="log")
+    curve.legend(loc="upper left")
     write_atomic(path, figure.savefig)
 
 

@@ -7,9 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from common import speed
+from common import networks, runs, speed, weights
 from common.belief import Believed
 from common.env import PushVectorEnv
+from common.files import UserError
 from common.observation import Observed
 from common.symmetry import Mirrored, mirror
 from common.task import World
@@ -26,6 +27,8 @@ class EstimatorKind:
     label: str
     likelihood: bool  # trained with eq. 1, else with the mean squared error
     dropout: bool  # MC dropout in training and use
+    nets: tuple[tuple[str, int], ...] = ()  # (kind, seed) of what it is an ensemble of; none: it is trained itself
+    scaled: bool = False  # by their scales
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,7 @@ class Method:
     reads: Literal["s", "o", "s_hat", "s_hat, sigma"]  # true state, observation with xi, estimate, and with its uncertainty
     estimator: str | None  # key of ESTIMATORS: the one in its loop
     training: Literal["pi_priv", "rl", "cloning"]  # pi_priv: the policy of 01, untouched; the others are trained by 04
+    published: bool = True  # by the paper; the others are trained when they are named
 
     def __post_init__(self):
         if (self.reads in ("s", "o")) != (self.estimator is None) or self.reads not in {
@@ -47,6 +51,8 @@ ESTIMATORS = {
     "ours": EstimatorKind("ours (likelihood + MC dropout)", likelihood=True, dropout=True),
     "likelihood": EstimatorKind("likelihood loss", likelihood=True, dropout=False),
     "mse": EstimatorKind("MSE loss", likelihood=False, dropout=False),
+    "ensemble": EstimatorKind("three of likelihood loss", True, False, nets=tuple(("likelihood", k) for k in range(3))),
+    "ours_scaled": EstimatorKind("ours, scaled", True, True, nets=(("ours", 0),), scaled=True),
 }
 METHODS = {
     "est_uncertainty": Method(r"$\pi_{est}(\hat{s}, \hat{\Sigma})$", "s_hat, sigma", "ours", "rl"),
@@ -56,7 +62,25 @@ METHODS = {
     "end_to_end": Method("end-to-end RL", "o", None, "rl"),
     "behavior_cloning": Method("behavior cloning", "o", None, "cloning"),
     "priv_on_state": Method(r"$\pi_{priv}(s)$", "s", None, "pi_priv"),
+    "est_likelihood": Method(r"$\pi_{est}$, likelihood", "s_hat, sigma", "likelihood", "rl", published=False),
+    "est_ensemble": Method(r"$\pi_{est}$, ensemble", "s_hat, sigma", "ensemble", "rl", published=False),
+    "est_scaled": Method(r"$\pi_{est}$, scaled sigma", "s_hat, sigma", "ours_scaled", "rl", published=False),
 }
+TRAINED = {name: kind for name, kind in ESTIMATORS.items() if not kind.nets}  # by 03
+
+
+def find_estimator(cfg, kind):
+    """Paths of the nets of a kind of estimator. Raises runs.Missing."""
+    return [runs.find(cfg, "03_train_estimator", "estimator.safetensors", name, seed)
+            for name, seed in ESTIMATORS[kind].nets or [(kind, 0)]]
+
+
+def load_estimator(kind, paths, device="cpu"):
+    """A kind of estimator from the paths of its nets. Raises UserError: a scale is asked for that is not known."""
+    nets = [weights.load(networks.Estimator, path, device) for path in paths]
+    if ESTIMATORS[kind].scaled and None in [net.scale for net in nets]:
+        raise UserError(f"{paths[0]} is of before its sigma was scaled: rerun 03_train_estimator.py with --force")
+    return networks.Ensemble(nets, ESTIMATORS[kind].scaled) if ESTIMATORS[kind].nets else nets[0]
 
 
 def make(method, num_envs, estimator=None, passes=1, occlusion=None, privileged=False, world=World()):

@@ -3,7 +3,7 @@ import math
 
 import numpy as np
 
-from common import task
+from common import calibration, task
 
 Z = 1.959964  # 95 % of a normal distribution
 ERRORS = ("trans_mean_l2_mm", "trans_rmse_mm", "rot_mean_abs_deg", "rot_rmse_deg")
@@ -36,15 +36,18 @@ def errors(sums):
 
 
 def error_table(sums):
-    """`errors` over all steps and, below "seen" and "occluded", over those."""
-    return errors(sums["all"]) | {name: errors(sums[name]) for name in ("seen", "occluded")}
+    """`errors` over all steps and, below "seen" and "occluded", over those; and whether sigma is true."""
+    return errors(sums["all"]) | {name: errors(sums[name]) for name in ("seen", "occluded")} | {
+        name: calibration.summary(sums[name]) for name in calibration.TALLIES if name in sums}
 
 
 def in_the_loop(values):
-    """Errors and shares within 1 and 2 standard deviations from the episodes' sums of trajectories.in_the_loop."""
-    sums = np.array(values).T
-    one, two = (sums[5:].sum(1) / sums[0].sum()).tolist()  # 0: the estimator tells no deviations
-    return errors(sums[:5]) | {"within_1_sigma": one or None, "within_2_sigma": two or None, "episodes": len(values)}
+    """Errors, calibration and what sigma foresees, from the episodes of trajectories.in_the_loop."""
+    parts = {name: np.array([value[name] for value in values]) for name in values[0]}
+    told = errors(parts.pop("all").T) | {"episodes": len(values)}
+    if "course" in parts:
+        told["foreseen"] = calibration.foreseen(parts.pop("course"))
+    return told | {name: calibration.summary(tallies) for name, tallies in parts.items()}
 
 
 def spread(values):
@@ -54,8 +57,8 @@ def spread(values):
 def summarise(done):
     """results.json from {section/key/...: one number an episode, or an error table}, as 05 measures them."""
     results = {"occlusion_duration": {}, "other_worlds": {}}
-    kinds = {"estimator_ablation": dict, "success_rate": list, "contact_switches": lambda v: spread(v) | {"episodes": len(v)},
-             "in_the_loop": in_the_loop}
+    kinds = {"estimator_ablation": dict, "filter": dict, "success_rate": list, "in_the_loop": in_the_loop,
+             "contact_switches": lambda v: spread(v) | {"episodes": len(v)}}
     for name, values in done.items():
         *keys, last = name.split("/")
         rows = results

@@ -1,7 +1,7 @@
 """The tables of sec. 5 and 6 in Markdown, of whatever methods were measured."""
 import math
 
-from common import paper
+from common import calibration, paper
 from common.statistics import ERRORS, Z
 
 
@@ -12,6 +12,11 @@ def aligned(header, rows):
     head, *lines = (f"| {' | '.join(row)} |" for row in cells)
     rule = "|" + "|".join("-" * (w + 1) + (":" if i else "-") for i, w in enumerate(widths)) + "|"
     return "\n".join([head, rule, *lines])
+
+
+def titled(title, header, rows):
+    """A table below its title, nothing if it has no rows."""
+    return f"{title}\n\n{aligned(header, rows)}" if rows else ""
 
 
 def percent(rate):
@@ -58,17 +63,47 @@ def estimator_ablation(results):
 
 
 def in_the_loop(results):
-    """Errors of the estimates while each policy plays, and how often the truth lies within 1 and 2 standard deviations."""
+    """Errors of the estimates while each policy plays."""
+    rows = [[method, *(within(e[key], e["half_95"][key]) for key in (ERRORS[0], ERRORS[2]))]
+            for method, e in results.get("in_the_loop", {}).items()]
+    return titled("Errors of the estimate in the loop, with 95 % intervals", ["policy", "mean L2 (mm)", "mean abs. (deg)"], rows)
+
+
+def calibrated(results):
+    """Whether sigma is true, on the test set and in each policy's loop, as it is and scaled on the validation set."""
     rows = []
-    for method, e in results.get("in_the_loop", {}).items():
-        shares = e["within_1_sigma"], e["within_2_sigma"]
-        rows.append([method, *(within(e[key], e["half_95"][key]) for key in (ERRORS[0], ERRORS[2])),
-                     *("" if share is None else f"{share:.1%}" for share in shares)])
-    if not rows:
-        return ""
-    title = "Errors of the estimate in the loop, with 95 % intervals, and the share of x, y, sin and cos within their sigma"
-    header = ["policy", "mean L2 (mm)", "mean abs. (deg)", "1 sigma (normal: 68.3%)", "2 sigma (95.4%)"]
-    return f"{title}\n\n{aligned(header, rows)}"
+    for name, e in (results["estimator_ablation"] | results.get("in_the_loop", {})).items():
+        for key in calibration.TALLIES:
+            if told := e.get(key):
+                shares = [", ".join(f"{100 * x:.0f}" for x in told[f"within_{k}_sigma"]) for k in (1, 2)]
+                nees = [told["nees"]["mean"][age] for age in (0, 3, 10)]
+                scores = [", ".join(f"{x:.2f}" for x in values) for values in (told["nll"], told["crps"], nees)]
+                rows.append([f"{name}{', scaled' * (key == 'scaled')}", *shares, *scores])
+    title = "Calibration of x, y (mm) and theta (degrees), of estimators on the test set and in the loops of policies"
+    return titled(title, ["sigma of", "1 (68 %)", "2 (95 %)", "NLL", "CRPS", "NEES / 3: seen, 3 s, 10 s after"], rows)
+
+
+def foreseen(results):
+    """Whether sigma tells that an episode leaves the workspace."""
+    rows = [[method, str(told["left"]), *(points(told[score]) for score in ("sigma", "rise", "time"))]
+            for method, e in results.get("in_the_loop", {}).items() if (told := e.get("foreseen"))]
+    header = ["policy", "left", "by sigma", "by its rise in 1 s", "by elapsed time"]
+    return titled("Leaving the workspace within 2 s, foreseen: area under the ROC curve in %, with 95 % intervals", header, rows)
+
+
+def filtered(results):
+    """The particle filter beside the estimators, on the same trajectories."""
+    sets = results.get("filter", {})
+    kinds = [*next(iter(sets.values()), {})]
+    rows = [[name, *(", ".join(f"{rates[kind][key]:.2f}" for key in (ERRORS[0], ERRORS[2])) for kind in kinds)]
+            for name, rates in sets.items()]
+    return titled("The particle filter beside the estimators: mean L2 (mm), mean abs. (deg)", ["trajectories", *kinds], rows)
+
+
+def filter_loop(results):
+    """Success with the particle filter in the loop instead of ours, on the same episodes."""
+    rows = [[method, *map(percent, rates.values())] for method, rates in results.get("filter_loop", {}).items()]
+    return titled("Success with the particle filter in the loop, on the same episodes", ["policy", "ours", "filter"], rows)
 
 
 def success_rate(results):
@@ -116,7 +151,8 @@ def further(results):
                      for method, rate in rates.items())
 
 
-SECTIONS = (beside_paper, estimator_ablation, success_rate, in_the_loop, occlusion_duration, other_worlds, further)
+SECTIONS = (beside_paper, estimator_ablation, success_rate, in_the_loop, calibrated, foreseen, filtered, filter_loop,
+            occlusion_duration, other_worlds, further)
 
 
 def every(results):

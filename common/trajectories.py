@@ -2,7 +2,7 @@
 import numpy as np
 import torch
 
-from common import observation, ranks, runs, speed, symmetry, task
+from common import calibration, observation, ranks, runs, speed, symmetry, task
 from common.files import UserError
 
 POOL = 16  # mini-batches that are sorted by length together: random ones are a quarter padding
@@ -83,34 +83,45 @@ def pose_errors(q_hat, q, occluded, mask):
     return {name: (terms * chosen).sum(1) for name, chosen in steps.items()}
 
 
-def in_the_loop(rows, length):
-    """Errors of the beliefs while a policy played: film.Recorded's rows, lengths (N,) of the episodes.
+def compared(q_hat, variance, q, occluded, mask, scale=None):
+    """`pose_errors`, and of estimates that tell a variance (T, B, 4) calibration's tallies [(B, .)], also of it scaled."""
+    told = pose_errors(q_hat, q, occluded, mask)
+    if variance is not None and variance.any():
+        q_hat, variance, q, occluded, mask = (x.double().cpu().numpy() for x in (q_hat, variance, q, occluded, mask))
+        told |= {name: calibration.tally(q_hat, variance * np.square(factors), q, occluded, mask).tolist()
+                 for name, factors in zip(calibration.TALLIES, ([1.0], scale)) if factors}
+    return told
 
-    (N, 7) sums over an episode's steps: those of pose_errors, and how many of x, y, sin and cos, as shares of the four, lie
-    within 1 and 2 of their standard deviations.
+
+def in_the_loop(rows, length, success, scale=None):
+    """Of the beliefs while a policy played, from film.Recorded's rows, lengths and success (N,) of the episodes: for each
+    episode `compared`'s parts, "all" (5,) of pose_errors, and calibration's "course".
     """
     state, o, belief = (np.stack([row[name] for row in rows[:length.max()]]) for name in ("state", "o", "belief"))
     q = symmetry.mirror(task.scale(state), symmetry.signs(o[0]))[..., :4]
-    mask = (np.arange(len(q))[:, None] < length).astype(np.float32)
-    sums = pose_errors(*map(torch.as_tensor, (belief[..., :4], q, o[..., 8], mask)))["all"]
-    off = np.abs(belief[..., :4] - q)
-    within = [((off <= k * belief[..., 8:]).mean(-1) * mask).sum(0) for k in (1, 2)]
-    return np.concatenate([sums, within]).T
+    mask, variance = (np.arange(len(q))[:, None] < length).astype(np.float32), np.square(belief[..., 8:])
+    told = compared(*map(torch.as_tensor, (belief[..., :4], variance, q, o[..., 8], mask)), scale)
+    parts = {"all": told["all"].T.tolist()} | {name: told[name] for name in calibration.TALLIES if name in told}
+    if len(parts) > 1:
+        parts["course"] = calibration.course(variance, length, success).tolist()
+    return [dict(zip(parts, values)) for values in zip(*parts.values())]
 
 
 @torch.no_grad()
-def measure(data, limit, size, seed, device, predict, world=task.World()):
-    """`pose_errors` of predict(o) (T, B, 4) over at most `limit` trajectories, with the same noise for every predict.
+def measure(data, limit, size, seed, device, predict, world=task.World(), scale=None):
+    """`compared` for predict(o), poses and variances (T, B, 4) or none, over at most `limit` trajectories, `size` at a time.
 
-    Each process measures some, and rank 0 has them all, the others none. Seeds torch for each batch.
+    Each process measures some, and rank 0 has them all, the others none. The noise is the same for every predict. Seeds torch
+    for each batch.
     """
     def one(job):
         k, index = job
         o, s, mask = observe(data, index, (seed, 0, k, 3), device, world)
         torch.manual_seed(int(np.random.SeedSequence([seed, k]).generate_state(1)[0]))
         with speed.autocast(device):
-            q_hat = predict(o)
-        return pose_errors(q_hat, s[..., :4], o[..., 8], mask)
+            q_hat, variance = predict(o)
+        return compared(q_hat, variance, s[..., :4], o[..., 8], mask, scale)
 
     parts = ranks.spread([*enumerate(batches(subset(data, limit), size))], one)
-    return {name: np.concatenate([part[name] for part in parts], 1) for name in (parts[0] if parts else ())}
+    return {name: sum((part[name] for part in parts), []) if name in calibration.TALLIES else
+            np.concatenate([part[name] for part in parts], 1) for name in (parts[0] if parts else ())}

@@ -4,7 +4,7 @@ import torch
 from common.files import UserError, load_tensors, save_tensors
 from common.networks import Estimator, Recurrent
 
-ARGUMENTS = {Recurrent: ("inputs", "outputs", "sizes"), Estimator: ("sizes", "dropout", "likelihood")}
+ARGUMENTS = {Recurrent: ("inputs", "outputs", "sizes"), Estimator: ("sizes", "dropout", "likelihood", "scale")}
 
 
 def save(path, net):

@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-from common import film, measurements, networks, plots, stacks, statistics, tables, task, trajectories, weights
+from common import calibration, film, measurements, networks, plots, stacks, statistics, tables, task, trajectories, weights
 from common.task import World
 
 evaluate = importlib.import_module("05_evaluate")
@@ -22,12 +22,12 @@ evaluate = importlib.import_module("05_evaluate")
 
 def players(num_envs=6, seed=0):
     """Players with small untrained nets instead of a run's."""
-    play = evaluate.Players(SimpleNamespace(num_envs=num_envs, seed=seed, passes=2), {}, torch.device("cpu"))
+    play = evaluate.Players(SimpleNamespace(num_envs=num_envs, seed=seed, passes=2, particles=20), {}, torch.device("cpu"))
     torch.manual_seed(0)
     nets = {size: networks.policy(size, (8, 8, 8)) for size in (8, 9, 12)}
     estimator = networks.Estimator((8, 8, 8))
-    inputs = {"est_uncertainty": 12, "end_to_end": 9, "behavior_cloning": 9}
-    play.policy = lambda method, seed: nets[inputs.get(method, 8)]
+    inputs = {"s": 8, "o": 9, "s_hat": 8, "s_hat, sigma": 12}
+    play.policy = lambda method, seed: nets[inputs[stacks.METHODS[method].reads]]
     play.estimator = lambda kind: estimator if kind else None
     return play
 
@@ -111,10 +111,10 @@ def test_an_episode_can_be_played_again(short):
 
 def test_a_measurement_is_the_same_whatever_was_measured_before_it(short, tmp_path):
     """Reading a net draws nothing: a rerun that measures one thing alone gives what the whole run gave."""
-    paths = {("est_uncertainty", 0): tmp_path / "policy.safetensors", "ours": tmp_path / "estimator.safetensors"}
+    paths = {("est_uncertainty", 0): tmp_path / "policy.safetensors", "ours": [tmp_path / "estimator.safetensors"]}
     weights.save(paths["est_uncertainty", 0], networks.policy(12, (8, 8, 8)))
-    weights.save(paths["ours"], networks.Estimator((8, 8, 8)))
-    play = evaluate.Players(SimpleNamespace(num_envs=6, seed=0, passes=2), paths, torch.device("cpu"))
+    weights.save(*paths["ours"], networks.Estimator((8, 8, 8)))
+    play = evaluate.Players(SimpleNamespace(num_envs=6, seed=0, passes=2, particles=20), paths, torch.device("cpu"))
     beliefs = [[row["belief"] for row in play.chunk(evaluate.Measurement("est_uncertainty", 6), 0)[2].rows] for _ in range(2)]
     np.testing.assert_array_equal(*beliefs)
 
@@ -134,14 +134,22 @@ def made_up(seeds=1, methods=stacks.METHODS):
     """Values of every measurement, as 05 stores them."""
     rng = np.random.default_rng(0)
     row = {"trans_mean_l2_mm": 4.0, "trans_rmse_mm": 3.5, "rot_mean_abs_deg": 2.0, "rot_rmse_deg": 3.0}
+    steps = task.HORIZON
+    hidden = np.arange(steps)[:, None] > 20 + np.zeros(9)
+    tallies = calibration.tally(*rng.uniform(0.1, 0.9, (3, steps, 9, 4)), hidden, np.ones((steps, 9)))
+    sure = calibration.summary(tallies)
     done = {f"estimator_ablation/{kind}": {k: v * (10 if kind == "vision" else 1) for k, v in row.items()} |
-            {"half_95": row, "seen": row, "occluded": row} for kind in ("vision", *reversed(stacks.ESTIMATORS))}
+            {"half_95": row, "seen": row, "occluded": row, "calibration": sure, "scaled": sure} for kind in ("vision", *reversed(stacks.TRAINED))}
     cfg = evaluate.Config(episodes=40, sweep_episodes=20, switch_episodes=10)
     for name, m in evaluate.measurements(cfg, {(method, k): None for method in methods for k in range(seeds)}, World()).items():
         done[name] = rng.integers(0, 2, m.episodes).tolist()
         if m.errors:
-            done[name] = (rng.uniform(0, 1, (m.episodes, 7)) + [9, 0, 0, 0, 0, 0, 0]).tolist()
-    return done
+            length, won = rng.integers(10, steps, m.episodes), rng.random(m.episodes) < 0.5
+            courses = calibration.course(np.ones((steps, m.episodes, 4)), length, won)
+            done[name] = [{"all": [9, *rng.uniform(0, 1, 4)], "calibration": tallies[i % 9].tolist(), "course": courses[i].tolist()}
+                          for i in range(m.episodes)]
+    return done | {f"filter/{row}/{kind}": done["estimator_ablation/ours"] for row in ("test", "c=0.078")
+                   for kind in ("ours", "filter")}
 
 
 def test_results_have_the_published_layout():
@@ -162,31 +170,32 @@ def test_results_have_the_published_layout():
 
 
 def test_errors_in_the_loop_are_those_of_the_beliefs_before_the_actions(short):
-    _, length, env = players().chunk(evaluate.Measurement("est_uncertainty", 6), 0)
-    sums = trajectories.in_the_loop(env.rows, length)
+    success, length, env = players().chunk(evaluate.Measurement("est_uncertainty", 6), 0)
+    told = trajectories.in_the_loop(env.rows, length, success, [2.0] * 4)
     for world, n in enumerate(length):
         episode = env.episode(world, n)
         state, belief = episode["state"][:n], episode["belief"][:n]
-        q_hat, off = task.unscale_pose(belief[:, :4]), np.abs(belief[:, :4] - task.scale(state)[:, :4])
+        q_hat = task.unscale_pose(belief[:, :4])
         l2, angle = np.linalg.norm(q_hat[:, :2] - state[:, :2], axis=1), np.abs(task.wrap(q_hat[:, 2] - state[:, 2]))
-        shares = [(off <= k * belief[:, 8:]).mean(1).sum() for k in (1, 2)]
-        expected = [n, l2.sum(), (l2**2).sum(), angle.sum(), (angle**2).sum(), *shares]
-        assert sums[world] == pytest.approx(expected, rel=1e-4, abs=1e-5)
+        expected = [n, l2.sum(), (l2**2).sum(), angle.sum(), (angle**2).sum()]
+        assert told[world]["all"] == pytest.approx(expected, rel=1e-4, abs=1e-5)
+        sums, scaled = (calibration.parts([told[world][name]]) for name in calibration.TALLIES)
+        off = np.abs((q_hat - state[:, :3])[:, :2])
+        within = [(off <= k * belief[:, 8:10] * task.HALF).sum(0).tolist() for k in (1, 2)]
+        assert [sums["within"][0, i:i + 2].tolist() for i in (6, 15)] == within
+        assert scaled["ratios"] == pytest.approx(sums["ratios"] / 4)
+        assert told[world]["course"][0] == n and told[world]["course"][1] == (0 if success[world] else pytest.approx(
+            np.nan if n == task.HORIZON else 1, nan_ok=True))
 
 
 def test_a_table_of_errors_in_the_loop():
     rng = np.random.default_rng(0)
     steps = rng.integers(50, 300, 500)
-    off = np.abs(rng.standard_normal(500))  # of a normal distribution, the same at each of an episode's steps
-    sums = steps * np.stack([np.ones(500), *np.full((4, 500), [[0.004], [0.004**2], [0.02], [0.02**2]]), off < 1, off < 2])
-    sums = sums.T
-    row = statistics.in_the_loop(sums.tolist())
+    sums = steps[:, None] * [1, 0.004, 0.004**2, 0.02, 0.02**2]
+    row = statistics.in_the_loop([{"all": each.tolist()} for each in sums])
     assert row["trans_mean_l2_mm"] == pytest.approx(4.0) and row["rot_mean_abs_deg"] == pytest.approx(np.rad2deg(0.02))
-    assert row["within_1_sigma"] == pytest.approx(0.683, abs=0.05) and row["within_2_sigma"] == pytest.approx(0.954, abs=0.03)
-    unknown = statistics.in_the_loop((sums * [1, 1, 1, 1, 1, 0, 0]).tolist())
-    assert unknown["within_1_sigma"] is None and unknown["episodes"] == 500
-    text = tables.in_the_loop({"in_the_loop": {"est": row, "est_mse": unknown}})
-    assert "| est     | 4.00 [4.00, 4.00] |" in text and not tables.in_the_loop({})
+    text = tables.in_the_loop({"in_the_loop": {"est": row}})
+    assert "| est    | 4.00 [4.00, 4.00] |" in text and not tables.in_the_loop({})
 
 
 def test_other_worlds_differ_in_one_thing():
@@ -223,13 +232,14 @@ def test_several_seeds_give_mean_and_std_beside_the_first_seeds_interval():
 
 
 def test_tables_line_up_and_hold_every_method():
-    results = statistics.summarise(made_up(seeds=2))
+    published = [name for name, method in stacks.METHODS.items() if method.published]
+    results = statistics.summarise(made_up(2, published))
     for section in tables.SECTIONS[:-1]:
         text = section(results)
         lines = [line for line in text.splitlines() if line.startswith("|")]
         assert len({len(line) for line in lines}) == 1 and len(lines[0]) <= 130
         assert len({line.count("|") for line in lines}) == 1
-    assert all(f"| {m} " in tables.success_rate(results) for m in stacks.METHODS)
+    assert all(f"| {m} " in tables.success_rate(results) for m in published)
     assert "10.0%, 10.0%" in tables.estimator_ablation(results) and "(2)" in tables.success_rate(results)
     beside = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tables.beside_paper(results).splitlines()[4:]]
     assert len(beside) == 16 + 6 + 4 + 2 and ["error of ours: mean L2, mm", "4.00 [0.00, 8.00]", "4.42"] in beside

@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch import distributions, nn
 
-from common import files, networks, weights
+from common import files, networks, stacks, weights
+from common.files import UserError
 
 INPUTS = torch.randn(7, 5, 9)
 
@@ -221,3 +222,37 @@ def test_another_net_than_expected_is_a_users_error(tmp_path):
     weights.save(path, small())
     with pytest.raises(files.UserError, match="another net than expected: rerun its stage"):
         weights.load(networks.Recurrent, path)
+
+
+# Ensembles
+
+
+def test_an_ensemble_is_eqs_3_and_4_over_its_nets():
+    nets, o = [small(dropout=0.0).requires_grad_(False) for _ in range(3)], torch.randn(7, 5, 9)
+    told = [net.predict(o) for net in nets]
+    q, variance = (torch.stack([part[i] for part in told]) for i in range(2))
+    mean, total, hidden = networks.Ensemble(nets).predict(o)
+    assert mean == pytest.approx(q.mean(0)) and total == pytest.approx(variance.mean(0) + (q - q.mean(0)).square().mean(0))
+    first = networks.Ensemble(nets).predict(o[:3])  # a step at a time it goes on
+    again = networks.Ensemble(nets).predict(o[3:], first[2])
+    assert torch.cat([first[0], again[0]]) == pytest.approx(mean, abs=1e-6) and len(hidden) == 6
+
+
+def test_a_scaled_estimator_has_its_own_scale_of_sigma():
+    net, o = small(dropout=0.0).requires_grad_(False), torch.randn(7, 5, 9)
+    net.scale = [1.0, 2.0, 3.0, 0.5]
+    q, variance, _ = net.predict(o)
+    scaled = networks.Ensemble([net], scaled=True).predict(o)
+    assert scaled[0].equal(q) and scaled[1] == pytest.approx(variance * torch.tensor([1, 4, 9, 0.25]))
+
+
+def test_a_scale_is_kept_in_the_file(tmp_path):
+    net = small(dropout=0.0)
+    net.scale = [1.0, 2.0, 3.0, 0.5]
+    weights.save(tmp_path / "f.safetensors", net)
+    paths = [tmp_path / "f.safetensors"]
+    assert stacks.load_estimator("ours", paths).scale == net.scale and stacks.load_estimator("ours_scaled", paths).scaled
+    net.scale = None
+    weights.save(paths[0], net)
+    with pytest.raises(UserError, match="before its sigma was scaled: rerun 03_train_estimator.py with --force"):
+        stacks.load_estimator("ours_scaled", paths)

@@ -47,7 +47,8 @@ def test_a_copy_of_a_world_goes_on_as_the_world():
     order = rng.permutation(20)
     dynamics = {name: value[order] for name, value in original.dynamics.items()}
     worlds = original.worlds
-    copy.worlds.place(np.arange(20), worlds.box[order], worlds.pusher[order], dynamics, worlds.motion[:, order, 3:], worlds.force[order])
+    moving = worlds.motion[:, order, 3:], worlds.force[order]
+    copy.worlds.place(np.arange(20), worlds.box[order], worlds.pusher[order], dynamics, *moving)
     gone, other = play(original, action, 10)[:, order], play(copy, action[order], 10)
     assert other[..., :3] == pytest.approx(gone[..., :3], abs=1e-3)
     assert np.median(np.abs(other - gone)[..., :2]) < 1e-5  # Chipmunk's last impulses are not copied

@@ -15,7 +15,7 @@ import pytest
 import torch
 from conftest import SCRIPTS, run, start
 
-from common import command, files, measurements, networks, ppo, runs, stacks, statistics, task, trajectories, weights
+from common import collection, command, files, measurements, networks, ppo, runs, stacks, statistics, task, trajectories, weights
 from common.env import PushVectorEnv
 from common.task import World
 
@@ -34,7 +34,7 @@ OUTPUTS = {
     "04_train_policy/behavior_cloning/seed0": ["policy.safetensors", "bc_loss.png"],
     "05_evaluate/seed0": ["results.json", "measurements.json", "tables.md", "success_rate.png", "occlusion_duration.png",
                           "sim.png", "trajectory_with_uncertainty.png", "film.mp4", "film.gif", "success_rate_priv.png",
-                          "likelihood_loss.png", "mse_loss.png", "bc_loss.png"],
+                          "likelihood_loss.png", "mse_loss.png", "bc_loss.png", "calibration.png"],
     "06_robot/seed0": ["summary.json", "robot.png", "natural_000.npz", "hand_5s_000.npz", "hand_full_000.npz"],
 } | {f"04_train_policy/{m}/seed0": ["policy.safetensors", "training.png", "success_rate.png"]
      for m in sorted(POLICIES - {"behavior_cloning"})}
@@ -156,8 +156,7 @@ def test_every_checkpoint_plays_as_many_episodes(study):
 
 
 def test_a_drifting_player_sees_the_box_off_its_pose_in_the_last_worlds():
-    collect = importlib.import_module("02_collect")
-    env = collect.Drifting(PushVectorEnv(600), 400)
+    env = collection.Drifting(PushVectorEnv(600), 400)
     errors, obs = [], env.reset(seed=3)[0]
     for _ in range(task.HORIZON - 1):  # no world ends before
         errors.append(task.unscale_pose(obs[:, :4]) - env.unwrapped.box)
@@ -166,11 +165,11 @@ def test_a_drifting_player_sees_the_box_off_its_pose_in_the_last_worlds():
     errors = np.array(errors)
     errors[..., 2] = task.wrap(errors[..., 2])
     assert np.abs(errors[:, :200]).max() < 1e-5
-    assert errors[60:, 200:].std((0, 1)) == pytest.approx(collect.DRIFT / 3**0.5, rel=0.1)  # sizes are uniform
-    later = int(collect.DRIFT_TIME * task.RATE)
+    assert errors[60:, 200:].std((0, 1)) == pytest.approx(collection.DRIFT / 3**0.5, rel=0.1)  # sizes are uniform
+    later = int(collection.DRIFT_TIME * task.RATE)
     kept = (errors[60:-later] * errors[60 + later:])[:, 200:].mean((0, 1)) / errors[60:, 200:].var((0, 1))
     assert kept == pytest.approx(np.full(3, np.exp(-1)), abs=0.1)
-    again = collect.Drifting(PushVectorEnv(600), 400)
+    again = collection.Drifting(PushVectorEnv(600), 400)
     assert (again.reset(seed=3)[0] == env.reset(seed=3)[0]).all()
 
 
@@ -203,6 +202,15 @@ def test_results_have_every_number(study):
         assert 0 <= rate["low"] <= rate["mean"] <= rate["high"] <= 1 and rate["high"] > rate["low"]
     assert {rate["episodes"] for rate in rates} == {16}
     assert results["in_the_loop"].keys() == {"est_uncertainty", "est", "est_mse", "priv_on_estimate"}
+    for name in ("ours", "likelihood"):
+        told = results["estimator_ablation"][name]
+        assert {"calibration", "scaled"} <= told.keys() and told["calibration"]["crps"] != told["scaled"]["crps"]
+    assert "calibration" not in results["estimator_ablation"]["mse"] and "calibration" in results["in_the_loop"]["est"]
+    assert results["filter"].keys() == {"test", "drifting", *measurements.FILTERED}
+    for row in results["filter"].values():
+        assert row.keys() == ESTIMATORS | {"vision", "filter"} and all(each["trans_mean_l2_mm"] > 0 for each in row.values())
+    for rates in results["filter_loop"].values():
+        assert rates.keys() == {"ours", "filter"} and {rate["episodes"] for rate in rates.values()} == {4}
     assert results["contact_switches"].keys() == {"priv_on_state", "est_uncertainty"}
     for row in results["contact_switches"].values():
         assert row["mean"] >= 0 and row["std"] >= 0 and row["episodes"] == 16
@@ -231,8 +239,8 @@ def test_the_ablation_is_measured_on_the_test_set(study):
     f = {m: weights.load(networks.Estimator, study / f"smoke/03_train_estimator/{m}/seed0/estimator.safetensors")
          for m in ESTIMATORS}
     results = json.loads((study / "smoke/05_evaluate/seed0/results.json").read_text())["estimator_ablation"]
-    predictions = {"vision": lambda o: o[..., :4], "ours": lambda o: f["ours"].predict(o, passes=200)[0]}
-    for name, predict in (predictions | {m: lambda o, m=m: f[m](o)[0] for m in ("mse", "likelihood")}).items():
+    predictions = {"vision": lambda o: (o[..., :4], None), "ours": lambda o: f["ours"].predict(o, passes=200)[:2]}
+    for name, predict in (predictions | {m: lambda o, m=m: (f[m](o)[0], None) for m in ("mse", "likelihood")}).items():
         table = statistics.error_table(trajectories.measure(test, 12, 100, draws, "cpu", predict))
         for got, want in [(results[name], table), *((results[name][part], table[part]) for part in ("seen", "occluded"))]:
             for row, reference in ((got, want), (got["half_95"], want["half_95"])):

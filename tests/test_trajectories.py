@@ -135,7 +135,7 @@ def test_angles_are_compared_around_the_circle():
 def test_vision_alone_has_the_errors_of_its_noise():
     states = np.zeros((3000 * 20, 7), np.float32)
     data, seen = (states, np.arange(0, 60_001, 20)), task.World(occlusion_start=0.0)
-    table = statistics.error_table(trajectories.measure(data, 3000, 500, 0, "cpu", lambda o: o[..., :4], seen))
+    table = statistics.error_table(trajectories.measure(data, 3000, 500, 0, "cpu", lambda o: (o[..., :4], None), seen))
     assert table["trans_rmse_mm"] == pytest.approx(2.5 * math.sqrt(2), rel=0.03)
     assert table["trans_mean_l2_mm"] == pytest.approx(2.5 * math.sqrt(2) * math.sqrt(math.pi / 2), rel=0.03)
     assert table["rot_rmse_deg"] == pytest.approx(math.degrees(0.05 * math.sqrt(2)), rel=0.03)
@@ -145,6 +145,6 @@ def test_vision_alone_has_the_errors_of_its_noise():
 def test_every_estimator_is_measured_under_the_same_noise(data):
     seen = []
     for _ in range(2):
-        trajectories.measure(data, 3, 2, 5, "cpu", lambda o: seen.append(o) or o[..., :4])
+        trajectories.measure(data, 3, 2, 5, "cpu", lambda o: seen.append(o) or (o[..., :4], None))
     assert [o.shape[1] for o in seen] == [2, 1, 2, 1]  # three trajectories, two at a time
     assert seen[0].equal(seen[2]) and seen[1].equal(seen[3])

@@ -1,0 +1,123 @@
+"""Is sigma true? Coverage, NLL, CRPS and NEES of predicted Gaussians, and whether sigma foresees a failure."""
+import math
+
+import numpy as np
+import torch
+
+from common import task
+
+UNITS = np.array([1e3, 1e3, np.rad2deg(1)])  # x, y in mm, theta in degrees
+LEVELS = (0.25, 0.5, math.erf(1 / 2**0.5), 0.8, 0.9, math.erf(2 / 2**0.5))  # of central intervals; 1 and 2 sigma among them
+BOUNDS = (2**0.5 * torch.special.erfinv(torch.tensor(LEVELS, dtype=torch.float64))).tolist()  # the same in sigmas
+EDGES = np.geomspace(1, 32, 6)  # mm, of sigma in x and y together: error against sigma
+AGES = range(11)  # s since the box was last seen
+HORIZON = 2 * task.RATE  # steps within which a failure is to be foreseen
+TALLIES = ("calibration", "scaled")  # of the predicted sigma, and of it times the scale that the validation set gave
+PARTS = {"steps": 1, "ratios": 4, "within": 3 * len(LEVELS), "nll": 3, "crps": 3, "count": len(EDGES) + 1,
+         "squares": len(EDGES) + 1, "variances": len(EDGES) + 1, "nees": len(AGES)}  # of a tally, and their widths
+
+
+def deviations(q_hat, variance, q):
+    """Errors and standard deviations (..., 3) of x, y (mm) and theta (degrees) from scaled poses (..., 4).
+
+    theta = atan2(sin, cos) has to first order the variance (cos^2 var_sin + sin^2 var_cos) / (sin^2 + cos^2)^2.
+    """
+    error = task.unscale_pose(q_hat) - task.unscale_pose(q)
+    error[..., 2] = task.wrap(error[..., 2])
+    turned, length = np.square(q_hat[..., [3, 2]]) * variance[..., 2:], np.square(q_hat[..., 2:]).sum(-1)
+    sigma = np.concatenate([np.sqrt(variance[..., :2]) * task.HALF, (np.sqrt(turned.sum(-1)) / length)[..., None]], -1)
+    return UNITS * error, UNITS * sigma
+
+
+def tally(q_hat, variance, q, occluded, mask):
+    """What `summary` needs of each trajectory, (B, sum of PARTS), from poses and variances (T, B, 4), flags and mask (T, B).
+
+    Sums over the valid steps; of the NEES, e^T P^-1 e of (x, y, theta), one value at each of AGES, nan where there is none.
+    """
+    error, sigma = deviations(q_hat, variance, q)
+    z, mask = np.abs(error) / sigma, mask > 0
+    crps = sigma * (z * torch.special.erf(torch.as_tensor(z / 2**0.5)).numpy()
+                    + (2 / np.pi)**0.5 * np.exp(-z**2 / 2) - np.pi**-0.5)
+    spread, off = (np.hypot(*np.moveaxis(x[..., :2], -1, 0)) for x in (sigma, error))
+    bins = np.digitize(spread, EDGES)[..., None] == np.arange(len(EDGES) + 1)
+    steps = np.arange(len(mask))[:, None]
+    age = steps - np.maximum.accumulate(np.where(occluded > 0, 0, steps))
+    reached = (age[..., None] == task.RATE * np.array(AGES)) & mask[..., None]
+    nees = np.take_along_axis(np.square(z).sum(-1)[..., None], reached.argmax(0)[None], 0)[0]
+    terms = [np.ones_like(spread)[..., None], np.square(q_hat - q) / variance,
+             np.concatenate([z <= bound for bound in BOUNDS], -1), z**2 / 2 + np.log(2 * np.pi * sigma**2) / 2, crps,
+             bins, bins * off[..., None]**2, bins * spread[..., None]**2]
+    sums = [(term * mask[..., None]).sum(0) for term in terms]
+    return np.concatenate([*sums, np.where(reached.any(0), nees, np.nan)], 1)
+
+
+def parts(tallies):
+    """{name: (N, width)} of tallies (N, sum of PARTS)."""
+    return dict(zip(PARTS, np.split(np.asarray(tallies, float), np.cumsum([*PARTS.values()])[:-1], 1)))
+
+
+def scale(tallies):
+    """Factors (4,) on the standard deviations of x, y, sin and cos that make these steps the most likely."""
+    sums = parts(tallies)
+    return np.sqrt(sums["ratios"].sum(0) / sums["steps"].sum()).tolist()
+
+
+def bootstrap(statistic, count, draws=200):
+    """Mean with its 95 % interval of statistic(weights (count,)), how often each of `count` independent ones is drawn."""
+    rng = np.random.default_rng(0)
+    values = [statistic(rng.multinomial(count, np.full(count, 1 / count))) for _ in range(draws)]
+    low, high = np.nanpercentile(values, (2.5, 97.5), axis=0)
+    return {"mean": statistic(np.ones(count)), "low": low, "high": high}
+
+
+def summary(tallies):
+    """Calibration of tallies (N, sum of PARTS): shares within 1 and 2 sigma, NLL and CRPS of x, y (mm), theta (degrees);
+    the curve, {level: shares}; of bins of sigma (mm) the root mean square error (mm); and the NEES / 3 at AGES, 1 if true.
+    """
+    sums = parts(tallies)
+    steps, nees = sums["steps"].sum(), sums["nees"] / 3
+    curve = (sums["within"].sum(0) / steps).reshape(-1, 3).tolist()
+    count, there = np.maximum(sums["count"].sum(0), 1), np.isfinite(nees)
+    weighted = bootstrap(lambda w: w @ np.where(there, nees, 0) / np.maximum(w @ there, 1), len(nees))
+    return {"within_1_sigma": curve[2], "within_2_sigma": curve[5]} | {
+        name: (sums[name].sum(0) / steps).tolist() for name in ("nll", "crps")} | {
+        "curve": dict(zip(map("{:.3f}".format, LEVELS), curve)), "steps": sums["count"].sum(0).tolist(),
+        **{f"{name}_mm": np.sqrt(sums[of].sum(0) / count).tolist() for name, of in (("sigma", "variances"), ("rmse", "squares"))},
+        "nees": {name: np.asarray(x).tolist() for name, x in weighted.items()}, "nees_count": there.sum(0).tolist()}
+
+
+def course(variance, length, success):
+    """Of each episode (N, 2 + 20): length, whether it left the workspace (time-outs: nan), sigma in mm at each second.
+
+    From scaled variances (T, N, 4), lengths (N,) and success (N,).
+    """
+    left = np.where(success, 0.0, np.where(length < task.HORIZON, 1.0, np.nan))
+    sigma = np.full((task.HORIZON, len(length)), np.nan)
+    sigma[:len(variance)] = 1e3 * np.sqrt((variance[..., :2] * task.HALF**2).sum(-1))
+    return np.column_stack([length, left, sigma[::task.RATE].T])
+
+
+def area(score, label, weight):
+    """Area under the ROC curve of scores with 0-1 labels, each counted `weight` times; ties count half; nan of one label."""
+    _, rank = np.unique(score, return_inverse=True)
+    yes, no = (np.bincount(rank, weight * chosen) for chosen in (label, 1 - label))
+    pairs = yes.sum() * no.sum()
+    return float((yes * (np.cumsum(no) - no / 2)).sum() / pairs) if pairs else math.nan
+
+
+def foreseen(courses):
+    """How well sigma tells, each second of an episode (N, 22), whether it leaves the workspace within 2 s: areas under ROC
+    curves of sigma, its rise in the last second, and elapsed time alone, with intervals over episodes. Time-outs left out;
+    none if all or no episodes leave it.
+    """
+    courses = np.asarray(courses, float)
+    (length, left), sigma = courses[np.isfinite(courses[:, 1]), :2].T, courses[np.isfinite(courses[:, 1]), 2:]
+    if not 0 < left.sum() < len(left):
+        return None
+    seconds = np.arange(sigma.shape[1])
+    episode, second = np.nonzero((task.RATE * seconds < length[:, None]) & (seconds > 0))
+    now = sigma[episode, second]
+    label = left[episode] * (length[episode] - task.RATE * second <= HORIZON)
+    scores = {"sigma": now, "rise": now - sigma[episode, second - 1], "time": second}
+    return {name: bootstrap(lambda w: area(score, label, w[episode]), len(length)) for name, score in scores.items()} | {
+        "episodes": len(length), "left": int(left.sum())}
