@@ -191,17 +191,19 @@ def calibration(results, path):
     """Is sigma true? On the test set, and in the loop of est_uncertainty: coverage of central intervals, error against sigma,
     NEES after the last sight.
     """
-    told = {style(kind)[:2]: e["calibration"] for kind, e in results["estimator_ablation"].items() if "calibration" in e}
+    summaries = {style(kind)[:2]: e["calibration"] for kind, e in results["estimator_ablation"].items() if "calibration" in e}
     if loop := results.get("in_the_loop", {}).get("est_uncertainty"):
-        told["ours, in the loop", "0.3"] = loop["calibration"]
+        summaries["ours, in the loop", "0.3"] = loop["calibration"]
     figure, (curve, errors, nees) = new(11, 3.7, 1, 3)
-    for (label, color), c in told.items():
+    for (label, color), c in summaries.items():
         levels = [0, *map(float, c["curve"]), 1]
         curve.plot(levels, [0, *(np.mean(shares) for shares in c["curve"].values()), 1], "o-", ms=4, color=color, label=label)
         enough = np.array(c["steps"]) >= 100
         errors.plot(np.array(c["sigma_mm"])[enough], np.array(c["rmse_mm"])[enough], "o-", ms=4, color=color)
-        nees.plot(c["nees"]["mean"], color=color)
-        nees.fill_between(range(len(c["nees"]["mean"])), c["nees"]["low"], c["nees"]["high"], color=color, alpha=0.2, lw=0)
+        told = [i for i, count in enumerate(c["nees_count"]) if count >= 10]
+        mean, low, high = (np.array(c["nees"][name])[told] for name in ("mean", "low", "high"))
+        nees.plot(told, mean, color=color)
+        nees.fill_between(told, low, high, color=color, alpha=0.2, lw=0)
     limits = errors.get_xlim()
     for ax, line in ((curve, (0, 1)), (errors, limits)):
         ax.plot(line, line, color="0.5", lw=1, ls=":")
@@ -209,7 +211,7 @@ def calibration(results, path):
     curve.set(xlabel="central interval of the predicted Gaussian", ylabel="share of x, y, theta within")
     errors.set(xlabel="sigma in x, y (mm)", ylabel="root mean square error (mm)", xscale="log", yscale="log")
     nees.set(xlabel="time since the box was last seen (s)", ylabel="NEES / 3", yscale="log")
-    curve.legend(loc="upper left")
+    figure.legend(*curve.get_legend_handles_labels(), loc="outside lower center", ncols=len(summaries))
     write_atomic(path, figure.savefig)
 
 

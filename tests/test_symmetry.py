@@ -37,6 +37,7 @@ def test_the_simulator_has_the_symmetries():
     box = np.tile(env.box[:count], (4, 1)) * np.hstack([sign, turn])
     pusher = np.tile(env.pusher[:count], (4, 1)) * sign
     dynamics = {name: np.tile(value[:count], 4) for name, value in env.dynamics.items()}
+    dynamics |= {name: dynamics[name] * side for name, side in zip(("support_x", "support_y"), sign.T)}
     env.reset(options={"box": box, "pusher": pusher, **dynamics})
     touched = np.zeros(count, bool)
     toward = np.where(env.box[:count, :2] > env.pusher[:count], 3, -3)
