@@ -48,7 +48,7 @@ _QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy
               kl_target_end=0.003, lr=3e-4, lr_min=2e-5, lr_max=2e-3, warm_start=True, privileged_critic=True,
               bc_lr=2e-3, bc_lr_end=5e-5)
 PRESETS = {
-    "smoke": dict(num_envs=32, rollout_steps=16, updates=4, minibatch=256, epochs=2, sizes=(16, 16, 16), eval_every=2,
+    "smoke": dict(num_envs=32, rollout_steps=16, updates=4, minibatch=256, epochs=2, sizes=(16, 16, 16), eval_every=4,
                   eval_episodes=16, resume_every=2, warm_start=True, privileged_critic=True, passes=2, bc_sequences=16,
                   bc_epochs=2, bc_validation=12),
     "quick": _QUICK | dict(updates=80, sizes=(64, 128, 64), passes=5, bc_sequences=25, bc_epochs=2, bc_validation=500),
