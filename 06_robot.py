@@ -236,10 +236,10 @@ def main(cfg):
         if screen:
             screen.arm = arm
             print(f"see http://127.0.0.1:{screen.server_port}")
-        if cfg.camera:
-            clock = (lambda: arm.arm.time) if isinstance(arm.arm, hardware.SimulatedArm) else time.monotonic
-            arm.camera = hardware.VideoCamera(cfg.camera, clock, cfg.latency / task.RATE)
-        play(cfg, arm, f, pi, paths, scenarios, screen)
+        clock = (lambda: arm.arm.time) if isinstance(arm.arm, hardware.SimulatedArm) else time.monotonic
+        own = contextlib.nullcontext(arm.camera)
+        with hardware.VideoCamera(cfg.camera, clock, cfg.latency / task.RATE) if cfg.camera else own as arm.camera:
+            play(cfg, arm, f, pi, paths, scenarios, screen)
 
 
 if __name__ == "__main__":

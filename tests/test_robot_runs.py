@@ -404,6 +404,29 @@ def test_a_live_camera_never_makes_the_arm_wait(monkeypatch):
     assert all(camera.grab()[0] == 0.5 for _ in range(3)) and camera.grab()[1][0, 0, 0] == 2
 
 
+def test_a_camera_that_is_left_ends_its_thread_and_gives_the_device_back(monkeypatch):
+    class Steady:
+        released = False
+
+        def __init__(self, source):
+            pass
+
+        def isOpened(self):
+            return True
+
+        def read(self):
+            time.sleep(0.01)
+            return True, np.zeros((480, 640, 3), np.uint8)
+
+        def release(self):
+            self.released = True
+
+    monkeypatch.setattr(cv2, "VideoCapture", Steady)
+    with hardware.VideoCamera("0", time.monotonic, 0.0) as camera:
+        assert camera.thread.is_alive()
+    assert not camera.thread.is_alive() and camera.capture.released
+
+
 @pytest.mark.parametrize("corner", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
 def test_the_program_thinks_as_the_training_stack_does(corner, float32):
     """The same observations, estimates and actions as Mirrored, Believed and the policy."""

@@ -132,6 +132,7 @@ class VideoCamera:
     """A camera that OpenCV opens: of a device number or an address always the newest image, of a file each image in turn.
 
     clock() tells the arm's time in s, latency is from an exposure to its reading, in s; UserError if OpenCV cannot open it.
+    Leaving it ends its thread and gives the device back, unless the device hangs.
     """
 
     def __init__(self, source, clock, latency):
@@ -139,16 +140,28 @@ class VideoCamera:
         if not self.capture.isOpened():
             raise UserError(f"--camera {source}: OpenCV cannot open it; give a device number, a file or an address")
         self.clock, self.latency, self.live = clock, latency, not Path(source).is_file()
-        if self.live:  # a thread, so that nobody waits for an image while the arm moves
+        self.thread = threading.Thread(target=self.follow, daemon=True)  # nobody waits for an image while the arm moves
+        self.left = False
+        if self.live:
             self.newest = self.read()
-            threading.Thread(target=self.follow, daemon=True).start()
+            self.thread.start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.left = True
+        if self.live:
+            self.thread.join(1.0)
+        if not self.thread.is_alive():
+            self.capture.release()
 
     def read(self):
         good, image = self.capture.read()
         return self.clock() - self.latency, image if good else None
 
     def follow(self):
-        while self.newest[1] is not None:
+        while not self.left and self.newest[1] is not None:
             self.newest = self.read()
 
     def grab(self):
