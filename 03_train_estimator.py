@@ -90,8 +90,8 @@ def main(cfg):
         measured = against_passes(estimator, validation_set, cfg, device, run.world)
         if ranks.RANK:
             continue
-        if told := measured[max(measured)].get("calibration"):
-            estimator.scale = calibration.scale(told)
+        if "calibration" in (sums := measured[max(measured)]):
+            estimator.scale = calibration.scale(sums["calibration"].T)
             weights.save(run.dir / "estimator.safetensors", estimator)
         errors = {m: statistics.error_table(sums) for m, sums in measured.items()}
         save_json(run.dir / "passes.json", errors)

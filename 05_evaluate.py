@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from common import command, film, plots, ranks, runs, stacks, statistics, tables, task, trajectories
-from common.files import load_json, save_json, write_atomic
+from common import command, film, particles, plots, ranks, runs, stacks, statistics, tables, task, trajectories
+from common.files import UserError, load_json, save_json, write_atomic
 from common.measurements import FILTERED, Measurement, measurements
 from common.players import LIST, Players
 from common.progress import bar
@@ -42,8 +42,7 @@ class Config(command.Reader):
 
 PRESETS = {
     "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, other_episodes=100, passes=10, num_envs=200,
-                       filter_trajectories=None,
-                       weights=Path(__file__).parent / "pretrained"),
+                       filter_trajectories=None, weights=Path(__file__).parent / "pretrained"),
     "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, other_episodes=None, passes=2, test=12,
                   num_envs=16, filter_trajectories=1, particles=10),
     "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, other_episodes=300, passes=20, test=2000, num_envs=300,
@@ -64,7 +63,8 @@ def trained(cfg):
         try:
             estimators[kind] = stacks.find_estimator(cfg, kind)
         except runs.Missing:
-            left_out += [f"estimator {kind}"] if kind in TRAINED else []
+            if kind in TRAINED:
+                left_out.append(f"estimator {kind}")
     for name, method in METHODS.items():
         stage, folder = ("01_train_privileged", None) if method.training == "pi_priv" else ("04_train_policy", name)
         for k in sorted({0, *runs.seeds(cfg.roots, stage, folder)}):
@@ -76,7 +76,8 @@ def trained(cfg):
                 runs.check_lineage(cfg, path.parent, runs.hashes_of(cfg, [pi_priv, *sum(estimators.values(), []), path]))
                 policies[name, k] = path
             except runs.Missing:
-                left_out += [label] if method.published else []
+                if method.published:
+                    left_out.append(label)
             except runs.Mixed:
                 left_out.append(f"{label} (on other nets than these)")
     return estimators, policies, left_out
@@ -180,6 +181,8 @@ def draw(run, players, results, done):
 
 
 def main(cfg):
+    if cfg.filter_trajectories and cfg.particles < particles.LEAST:
+        raise UserError(f"--particles {cfg.particles}: say {particles.LEAST} or more")
     device = command.device_of(cfg)
     estimators, policies, left_out = trained(cfg)
     test, test_paths = trajectories.load_set(cfg, "test")

@@ -108,16 +108,16 @@ def area(score, label, weight):
 def foreseen(courses):
     """How well sigma tells, each second of an episode (N, 22), whether it leaves the workspace within 2 s: areas under ROC
     curves of sigma, its rise in the last second, and elapsed time alone, with intervals over episodes. Time-outs left out;
-    none if all or no episodes leave it.
+    none if there is nothing to tell apart.
     """
     courses = np.asarray(courses, float)
     (length, left), sigma = courses[np.isfinite(courses[:, 1]), :2].T, courses[np.isfinite(courses[:, 1]), 2:]
-    if not 0 < left.sum() < len(left):
-        return None
     seconds = np.arange(sigma.shape[1])
     episode, second = np.nonzero((task.RATE * seconds < length[:, None]) & (seconds > 0))
     now = sigma[episode, second]
     label = left[episode] * (length[episode] - task.RATE * second <= HORIZON)
+    if not 0 < label.sum() < len(label):
+        return None
     scores = {"sigma": now, "rise": now - sigma[episode, second - 1], "time": second}
     return {name: bootstrap(lambda w: area(score, label, w[episode]), len(length)) for name, score in scores.items()} | {
         "episodes": len(length), "left": int(left.sum())}

@@ -75,8 +75,8 @@ class Estimator(nn.Module):
     """f: LSTM 1024, then linear 512, 256, 8 with tanh and dropout before every linear layer (sec. 4).
 
     `sizes` are those of the LSTM and the two hidden linear layers. Without `likelihood` it predicts the pose alone (4 outputs,
-    MSE), not its log-variances too. The variants without MC dropout have the probability 0. `scale`, if known,
-    are factors on its four standard deviations that fit the validation set best; only an Ensemble applies them.
+    MSE), not its log-variances too. The variants without MC dropout have the probability 0. `scale`, if known, are the factors
+    on its four standard deviations that fit the validation set best; only an Ensemble applies them.
     """
 
     def __init__(self, sizes=(1024, 512, 256), dropout=0.2, likelihood=True, scale=None):

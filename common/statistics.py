@@ -38,7 +38,7 @@ def errors(sums):
 def error_table(sums):
     """`errors` over all steps and, below "seen" and "occluded", over those; and whether sigma is true."""
     return errors(sums["all"]) | {name: errors(sums[name]) for name in ("seen", "occluded")} | {
-        name: calibration.summary(sums[name]) for name in calibration.TALLIES if name in sums}
+        name: calibration.summary(sums[name].T) for name in calibration.TALLIES if name in sums}
 
 
 def in_the_loop(values):

@@ -84,11 +84,11 @@ def pose_errors(q_hat, q, occluded, mask):
 
 
 def compared(q_hat, variance, q, occluded, mask, scale=None):
-    """`pose_errors`, and of estimates that tell a variance (T, B, 4) calibration's tallies [(B, .)], also of it scaled."""
+    """`pose_errors`, and of estimates that tell a variance (T, B, 4) calibration's tallies (., B), also of it scaled."""
     told = pose_errors(q_hat, q, occluded, mask)
     if variance is not None and variance.any():
         q_hat, variance, q, occluded, mask = (x.double().cpu().numpy() for x in (q_hat, variance, q, occluded, mask))
-        told |= {name: calibration.tally(q_hat, variance * np.square(factors), q, occluded, mask).tolist()
+        told |= {name: calibration.tally(q_hat, variance * np.square(factors), q, occluded, mask).T
                  for name, factors in zip(calibration.TALLIES, ([1.0], scale)) if factors}
     return told
 
@@ -101,7 +101,7 @@ def in_the_loop(rows, length, success, scale=None):
     q = symmetry.mirror(task.scale(state), symmetry.signs(o[0]))[..., :4]
     mask, variance = (np.arange(len(q))[:, None] < length).astype(np.float32), np.square(belief[..., 8:])
     told = compared(*map(torch.as_tensor, (belief[..., :4], variance, q, o[..., 8], mask)), scale)
-    parts = {"all": told["all"].T.tolist()} | {name: told[name] for name in calibration.TALLIES if name in told}
+    parts = {name: told[name].T.tolist() for name in ("all", *calibration.TALLIES) if name in told}
     if len(parts) > 1:
         parts["course"] = calibration.course(variance, length, success).tolist()
     return [dict(zip(parts, values)) for values in zip(*parts.values())]
@@ -123,5 +123,4 @@ def measure(data, limit, size, seed, device, predict, world=task.World(), scale=
         return compared(q_hat, variance, s[..., :4], o[..., 8], mask, scale)
 
     parts = ranks.spread([*enumerate(batches(subset(data, limit), size))], one)
-    return {name: sum((part[name] for part in parts), []) if name in calibration.TALLIES else
-            np.concatenate([part[name] for part in parts], 1) for name in (parts[0] if parts else ())}
+    return {name: np.concatenate([part[name] for part in parts], 1) for name in (parts[0] if parts else ())}

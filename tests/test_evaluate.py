@@ -139,7 +139,8 @@ def made_up(seeds=1, methods=stacks.METHODS):
     tallies = calibration.tally(*rng.uniform(0.1, 0.9, (3, steps, 9, 4)), hidden, np.ones((steps, 9)))
     sure = calibration.summary(tallies)
     done = {f"estimator_ablation/{kind}": {k: v * (10 if kind == "vision" else 1) for k, v in row.items()} |
-            {"half_95": row, "seen": row, "occluded": row, "calibration": sure, "scaled": sure} for kind in ("vision", *reversed(stacks.TRAINED))}
+            {"half_95": row, "seen": row, "occluded": row, "calibration": sure, "scaled": sure}
+            for kind in ("vision", *reversed(stacks.TRAINED))}
     cfg = evaluate.Config(episodes=40, sweep_episodes=20, switch_episodes=10)
     for name, m in evaluate.measurements(cfg, {(method, k): None for method in methods for k in range(seeds)}, World()).items():
         done[name] = rng.integers(0, 2, m.episodes).tolist()

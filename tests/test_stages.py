@@ -429,6 +429,10 @@ def test_a_box_that_the_robot_is_not_made_for_is_one_line(copy, call):
     assert not (out / "smoke" / "06_robot").exists()
 
 
+def test_too_few_particles_are_one_line(study, call):
+    assert is_mistake(*call(study, "05_evaluate", "--particles", "9"), "--particles 9", "say 10 or more")
+
+
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_every_preset_is_a_config(script):
     module = importlib.import_module(script)
