@@ -209,8 +209,8 @@ def calibration(results, path):
         ax.plot(line, line, color="0.5", lw=1, ls=":")
     nees.axhline(1, color="0.5", lw=1, ls=":")
     curve.set(xlabel="central interval of the predicted Gaussian", ylabel="share of x, y, theta within")
-    errors.set(xlabel="sigma in x, y (mm)", ylabel="root mean square error (mm)", xscale="log", yscale="log")
-    nees.set(xlabel="time since the box was last seen (s)", ylabel="NEES / 3", yscale="log")
+    errors.set(xlabel="sigma in x, y (mm)", ylabel="root mean square error (mm)")
+    nees.set(xlabel="time since the box was last seen (s)", ylabel="NEES / 3", ylim=(0, None))
     figure.legend(*curve.get_legend_handles_labels(), loc="outside lower center", ncols=len(summaries))
     write_atomic(path, figure.savefig)
 

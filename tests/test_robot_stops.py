@@ -1,4 +1,5 @@
 """Stage 06: the control thread, and each thing besides a bad reading that must stop the arm."""
+import fcntl
 import hashlib
 import importlib
 import os
@@ -6,6 +7,7 @@ import pty
 import signal
 import subprocess
 import sys
+import termios
 import threading
 import time
 from pathlib import Path
@@ -180,15 +182,22 @@ def test_a_closed_terminal_stops_the_arm_before_anything_is_printed(nets):  # no
     master, terminal = pty.openpty()
     arguments = [sys.executable, ROOT / "06_robot.py", "smoke", "--out", nets, "--arm", f"{__name__}:Written", "--runs", "50",
                  "--realtime", "--seed", "99"]
+
+    def own_the_terminal():
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests under nohup ignore it, and the program keeps to that
+
     process = subprocess.Popen(arguments, stdin=terminal, stdout=terminal, stderr=terminal, start_new_session=True,
-                               env=os.environ | {"PYTHONPATH": str(Path(__file__).parent)},
-                               preexec_fn=lambda: __import__("fcntl").ioctl(0, __import__("termios").TIOCSCTTY, 0))
+                               env=os.environ | {"PYTHONPATH": str(Path(__file__).parent)}, preexec_fn=own_the_terminal)
     os.close(terminal)
     tape, until = nets / "tape", time.monotonic() + 60
     while not (tape.exists() and tape.read_text().count("\n") > 50) and time.monotonic() < until and process.poll() is None:
         time.sleep(0.05)
     os.close(master)
-    assert process.wait(30) == 2
+    try:
+        assert process.wait(30) == 2
+    finally:
+        process.kill()
     lines = tape.read_text().split("\n")[:-1]
     first = lines.index("stopped without a terminal")
     assert first > 50 and set(lines[first:]) == {"stopped without a terminal"}
