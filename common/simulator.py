@@ -228,8 +228,8 @@ class Worlds:
 
     def _add_impulses(self, contacts, impulse):
         """Adds the last sub-step's contact impulses on the pushers, from (contacts, 4), to (N, 2)."""
-        j, point = np.split(contacts, 2, 1)
-        column, row = np.rint(point / SPACING).astype(int).T  # where it happened tells the world
+        j = contacts[:, :2]
+        column, row = np.rint(contacts[:, 2:] / SPACING).astype(int).T  # where it happened tells the world
         world = column * self._side + row
         impulse[world] += j  # on the first body of a contact, the pusher: Chipmunk puts circles before polygons
         self._touched[:] = False

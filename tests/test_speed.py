@@ -200,7 +200,7 @@ def test_passes_without_log_variances_have_none():
     assert q.shape == (5, 3, 2, 4) and log_var is None
 
 
-@pytest.mark.parametrize("shape, count", [((7, 5), 13), ((2, 2**13), 7)])
+@pytest.mark.parametrize("shape, count", [((7, 5), 13), ((70, 50), 13), ((2, 2**13), 7)])
 def test_passes_are_the_same_for_any_number_of_threads(pool, shape, count):
     f, z, told = small(dropout=0.3), torch.randn(*shape, 16), []
     for threads in (1, 2, 3, 1):
