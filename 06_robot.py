@@ -122,8 +122,8 @@ def control(drive, f, pi, cfg, hand, rows, screen):
     cues = {int(moment * task.RATE): f"now {word} the tags" for moment, word in zip(hand, ("cover", "uncover")) if moment < 60}
     tracker, memory, certain = tags.Tracker(), None, 0
     for _ in range(PATIENCE):
-        drive.aim(np.zeros(2))
         drive.tick()
+        drive.aim(np.zeros(2))  # not before the tick, or the silence until the first real target would be a step longer
         if (row := sense(arm, tracker))["seen"] is not None:
             break
     else:

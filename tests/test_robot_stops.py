@@ -106,6 +106,15 @@ def test_the_mean_of_a_control_step_is_as_noisy_as_the_training_worlds_force():
     assert abs(np.corrcoef(np.ravel(means[:-1]), np.ravel(means[1:]))[0, 1]) < 0.15
 
 
+def test_the_first_target_comes_a_step_after_the_first_sight_not_two(robot, monkeypatch):  # noqa: F811
+    module, order = importlib.import_module("06_robot"), []
+    for room, name in ((module, "sense"), (module, "think"), (controller.Controller, "tick"), (controller.Controller, "aim")):
+        monkeypatch.setattr(room, name, lambda *words, act=getattr(room, name), name=name: order.append(name) or act(*words))
+    robot("--scenario", "natural")
+    steady = ["sense", "think", "aim", "tick"]
+    assert order[:11] == ["think", "tick", "aim", *steady, *steady]  # the first of all is made before there is an arm
+
+
 # Stops
 
 
