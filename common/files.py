@@ -6,10 +6,6 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-import safetensors.torch
-import torch
-
-
 _locks = {}  # folder -> descriptor that holds its lock for this process
 
 
@@ -71,26 +67,6 @@ def load_json(path: Path, advice: str):
         return json.loads(path.read_text()) if path.exists() else None
     except ValueError:
         raise UserError(f"{path} is damaged: {advice}") from None
-
-
-def save_tensors(path: Path, tensors: dict[str, torch.Tensor], **meta):
-    """Writes a safetensors file; meta is anything that JSON holds."""
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    data = safetensors.torch.save(tensors, {"meta": json.dumps(meta)})  # one key: safetensors shuffles several
-    write_atomic(path, lambda temporary: temporary.write_bytes(data))
-
-
-def load_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict]:
-    """The tensors, on the CPU, and the meta of save_tensors.
-
-    Raises UserError: the file is missing or damaged.
-    """
-    try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            meta = json.loads((file.metadata() or {}).get("meta", "{}"))
-            return {name: file.get_tensor(name) for name in file.keys()}, meta
-    except (safetensors.SafetensorError, OSError, ValueError):
-        raise UserError(f"{path} is missing or damaged: rerun its stage with --force") from None
 
 
 def digest(path: Path) -> dict:

@@ -1,10 +1,33 @@
 """Files of the nets: float16 safetensors that say what to build."""
+import json
+
+import safetensors.torch
 import torch
 
-from common.files import UserError, load_tensors, save_tensors
+from common.files import UserError, write_atomic
 from common.networks import Estimator, Recurrent
 
 ARGUMENTS = {Recurrent: ("inputs", "outputs", "sizes"), Estimator: ("sizes", "dropout", "likelihood", "scale")}
+
+
+def save_tensors(path, tensors: dict[str, torch.Tensor], **meta):
+    """Writes a safetensors file; meta is anything that JSON holds."""
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    data = safetensors.torch.save(tensors, {"meta": json.dumps(meta)})  # one key: safetensors shuffles several
+    write_atomic(path, lambda temporary: temporary.write_bytes(data))
+
+
+def load_tensors(path) -> tuple[dict[str, torch.Tensor], dict]:
+    """The tensors, on the CPU, and the meta of save_tensors.
+
+    Raises UserError: the file is missing or damaged.
+    """
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            meta = json.loads((file.metadata() or {}).get("meta", "{}"))
+            return {name: file.get_tensor(name) for name in file.keys()}, meta
+    except (safetensors.SafetensorError, OSError, ValueError):
+        raise UserError(f"{path} is missing or damaged: rerun its stage with --force") from None
 
 
 def save(path, net):

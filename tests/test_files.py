@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from common import files
+from common import files, weights
 from common.files import UserError
 
 
@@ -26,18 +26,18 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
 
 def test_tensors_and_their_meta_come_back(tmp_path):
     net, path = torch.nn.Linear(2, 3), tmp_path / "net.safetensors"
-    files.save_tensors(path, net.state_dict(), method="ours", widths=[1, 2])
-    tensors, meta = files.load_tensors(path)
+    weights.save_tensors(path, net.state_dict(), method="ours", widths=[1, 2])
+    tensors, meta = weights.load_tensors(path)
     assert meta == {"method": "ours", "widths": [1, 2]}
     assert torch.equal(tensors["weight"], net.weight)
-    files.save_tensors(path, {"turned": torch.arange(6).view(2, 3).T})
-    assert files.load_tensors(path)[0]["turned"].tolist() == [[0, 3], [1, 4], [2, 5]]
+    weights.save_tensors(path, {"turned": torch.arange(6).view(2, 3).T})
+    assert weights.load_tensors(path)[0]["turned"].tolist() == [[0, 3], [1, 4], [2, 5]]
 
 
 @pytest.mark.parametrize("cut", [0, 5, 100])
 def test_damaged_tensors_name_the_file(tmp_path, cut):
     path = tmp_path / "03_train_estimator" / "net.safetensors"
-    files.save_tensors(path, {"w": torch.zeros(100)})
+    weights.save_tensors(path, {"w": torch.zeros(100)})
     path.write_bytes(path.read_bytes()[:cut])
     with pytest.raises(UserError, match="03_train_estimator/net.safetensors is missing or damaged"):
-        files.load_tensors(path)
+        weights.load_tensors(path)

@@ -195,7 +195,7 @@ def test_nets_come_back_from_files(tmp_path):
         parameter.data = parameter.half().float()  # as the files hold them
     weights.save(policy := tmp_path / "policy.safetensors", net)
     weights.save(estimator := tmp_path / "estimator.safetensors", f)
-    assert {x.dtype for path in (policy, estimator) for x in files.load_tensors(path)[0].values()} == {torch.float16}
+    assert {x.dtype for path in (policy, estimator) for x in weights.load_tensors(path)[0].values()} == {torch.float16}
     again, f_again = weights.load(networks.Recurrent, policy), weights.load(networks.Estimator, estimator)
     x = torch.randn(3, 2, 12)
     assert again(x)[0].equal(net(x)[0]) and f_again(INPUTS)[0].equal(f(INPUTS)[0])
@@ -216,7 +216,7 @@ def test_another_net_than_expected_is_a_users_error(tmp_path):
     weights.save(path, net)
     with pytest.raises(files.UserError, match="another net than expected: rerun its stage"):
         weights.load(networks.Estimator, path)
-    files.save_tensors(path, net.state_dict(), sizes=sizes)  # an Estimator by its arguments
+    weights.save_tensors(path, net.state_dict(), sizes=sizes)  # an Estimator by its arguments
     with pytest.raises(files.UserError, match="another net than expected: rerun its stage"):
         weights.load(networks.Estimator, path)
     weights.save(path, small())

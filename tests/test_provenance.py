@@ -12,8 +12,9 @@ from tyro.conf import OmitArgPrefixes
 
 from common import command, runs
 from common.command import setting
-from common.files import UserError, save_json, save_tensors
+from common.files import UserError, save_json
 from common.task import C_060, World
+from common.weights import save_tensors
 
 ROOT = Path(__file__).parent.parent
 BEFORE = World("inner", support=C_060, support_offset=(0.0, 0.0))

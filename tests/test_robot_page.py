@@ -1,6 +1,7 @@
 """The live page: what it shows, who may change what, and that nothing it is asked delays the robot."""
 import http.client
 import json
+import signal
 import socket
 import threading
 import time
@@ -18,11 +19,18 @@ ROW = dict(image=np.full((480, 640, 3), 128, np.uint8), corners=np.zeros((0, 4, 
            pusher=np.array([-0.1, 0.0]), force=np.array([5.0, 0.0]), points=placed().points)
 
 
-@pytest.fixture
-def screen():
+@pytest.fixture(scope="module")
+def served():
     with page.Page(0) as screen:
-        screen.arm = safety.Guarded(placed())
         yield screen
+
+
+@pytest.fixture
+def screen(served):
+    """A page with nothing on it yet, and an arm that nobody has touched."""
+    served.begin("")
+    served.jpeg, served.arm = b"", safety.Guarded(placed())
+    return served
 
 
 def ask(screen, method, path, origin="http://127.0.0.1:{}", host="127.0.0.1:{}"):
@@ -147,16 +155,29 @@ def test_the_stop_button_works_with_five_tabs_open(screen):
     assert took < 0.2 and screen.arm.stopped and screen.arm.arm.stopped and set(asked) == {200}
 
 
-def test_a_slow_drawing_delays_no_tick(screen, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(views, "composite", lambda row, tick, history: drawn.append(tick) or time.sleep(0.2) or row["image"])
-    spent = 0.0
-    for tick in range(50):
-        began = time.perf_counter()
+def test_a_painter_that_stands_still_delays_no_tick_and_paints_the_newest_next(screen):
+    screen.show(ROW, 0)
+    assert until(lambda: screen.jpeg)
+    screen.painter.send_signal(signal.SIGSTOP)
+    began = time.perf_counter()
+    for tick in range(1, 50):
         screen.show(ROW, tick)
-        spent += time.perf_counter() - began
-        time.sleep(0.01)
-    assert spent < 1.0 and 2 <= len(drawn) <= 25 and until(lambda: drawn[-1] == 49)  # not 50 drawings; only the newest
+    spent = time.perf_counter() - began
+    screen.painter.send_signal(signal.SIGCONT)
+    due = cv2.imencode(".jpg", views.composite(ROW, 49, list(screen.history))[..., ::-1])[1].tobytes()
+    assert spent < 0.5 and until(lambda: screen.jpeg == due)
+
+
+def test_the_page_outlives_its_painter():
+    with page.Page(0) as screen:
+        screen.arm = safety.Guarded(placed())
+        screen.show(ROW, 0)
+        assert until(lambda: screen.jpeg)
+        screen.painter.kill()
+        for tick in range(3):
+            screen.show(ROW, tick)
+            time.sleep(0.05)
+        assert ask(screen, "GET", "/frame")[:2] == (200, screen.jpeg) and ask(screen, "POST", "/stop")[0] == 204
 
 
 @pytest.mark.parametrize("words", ["taken", "70000"])

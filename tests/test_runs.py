@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from common import command, files, runs
+from common import command, files, runs, weights
 from common.files import UserError
 from common.runs import Run, find
 
@@ -26,7 +26,7 @@ def config(tmp_path):
 def make(cfg, stage, name, value, inputs={}, method=None):
     """A finished stage with one artifact."""
     run = Run(cfg, stage, inputs, method)
-    files.save_tensors(run.dir / name, {"w": torch.full((3,), float(value))}, value=value)
+    weights.save_tensors(run.dir / name, {"w": torch.full((3,), float(value))}, value=value)
     run.finish([name])
     return run
 

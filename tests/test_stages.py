@@ -101,8 +101,8 @@ def test_checkpoints_go_from_the_untrained_to_the_last_policy(study):
     folder = study / "smoke" / "01_train_privileged" / "seed0"
     torch.manual_seed(0)
     untrained = {name: x.half() for name, x in networks.policy(8, (16, 16, 16)).state_dict().items()}
-    first, middle, last = (files.load_tensors(path)[0] for path in sorted(folder.glob("checkpoint_*")))
-    policy = files.load_tensors(folder / "policy.safetensors")[0]
+    first, middle, last = (weights.load_tensors(path)[0] for path in sorted(folder.glob("checkpoint_*")))
+    policy = weights.load_tensors(folder / "policy.safetensors")[0]
     assert all(first[name].equal(untrained[name]) and last[name].equal(policy[name]) for name in policy)
     assert not any(middle[name].equal(x[name]) for x in (first, last) for name in policy)
 

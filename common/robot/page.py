@@ -1,10 +1,15 @@
 """A page on this machine: what the robot sees, believes and does, and a stop button; one can join in with the simulated arm."""
 import contextlib
 import json
+import multiprocessing
 import os
+import subprocess
+import sys
 import threading
 from collections import deque
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from multiprocessing.connection import Connection
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -51,8 +56,19 @@ follow()
 </script>""".replace("WIDTH", str(views.WIDTH)).replace("TOP", str(views.TOP)).replace("VIEW", str(draw.VIEW))
 
 
+def paint(pipe):
+    """The painter's process: answers each tick, as views.composite takes it, with its JPEG, until the other end is closed."""
+    os.nice(10)
+    cv2.setNumThreads(1)
+    pipe.send_bytes(b"")  # ready
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            pipe.send_bytes(cv2.imencode(".jpg", views.composite(*pipe.recv())[..., ::-1])[1].tobytes())
+
+
 class Page(ThreadingHTTPServer):
-    """Serves the page on the loopback address until the context ends; what is shown is drawn in a thread of its own.
+    """Serves the page on the loopback address until the context ends; what is shown is drawn in a process of its own, since a
+    thread would keep the interpreter from those that move the arm.
 
     `arm` is the safety.Guarded that its button stops, None until there is one. UserError where the port cannot be had.
     """
@@ -65,6 +81,12 @@ class Page(ThreadingHTTPServer):
         except (OSError, OverflowError, TypeError) as error:
             raise UserError(f"--view {port}: this port cannot be had ({error}); give another") from None
         self.fresh, self.history, self.drawing = threading.Event(), deque(maxlen=task.HORIZON), True
+        self.pipe, far = multiprocessing.Pipe()
+        self.painter = subprocess.Popen(  # a session of its own: Ctrl-C is for the program alone
+            [sys.executable, "-m", "common.robot.page", str(far.fileno())], cwd=Path(__file__).parents[2],
+            pass_fds=[far.fileno()], start_new_session=True)
+        far.close()
+        self.pipe.recv_bytes()
         self.threads = [threading.Thread(target=work, daemon=True) for work in (self.draw, lambda: self.serve_forever(0.1))]
         for thread in self.threads:
             thread.start()
@@ -74,8 +96,10 @@ class Page(ThreadingHTTPServer):
         self.fresh.set()
         self.shutdown()
         self.server_close()
-        for thread in self.threads:  # a thread in OpenCV would abort the interpreter's end
+        for thread in self.threads:
             thread.join(5)
+        self.pipe.close()
+        self.painter.wait(5)
 
     def begin(self, title):
         """A run begins."""
@@ -89,12 +113,11 @@ class Page(ThreadingHTTPServer):
         self.fresh.set()
 
     def draw(self):
-        with contextlib.suppress(OSError):  # a thread has a priority of its own on Linux only
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
-        while self.fresh.wait() and self.drawing:
-            self.fresh.clear()
-            image = views.composite(*self.latest, list(self.history))
-            self.jpeg = cv2.imencode(".jpg", image[..., ::-1])[1].tobytes()
+        with contextlib.suppress(EOFError, OSError):  # where the painter has gone the last image stays
+            while self.fresh.wait() and self.drawing:
+                self.fresh.clear()
+                self.pipe.send((*self.latest, list(self.history)))
+                self.jpeg = self.pipe.recv_bytes()
 
     def state(self):
         """The run, and what the guard says."""
@@ -150,3 +173,7 @@ class Request(BaseHTTPRequestHandler):
 
     def log_message(self, *words):
         """Requests are no news."""
+
+
+if __name__ == "__main__":
+    paint(Connection(int(sys.argv[1])))
