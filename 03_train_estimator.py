@@ -63,13 +63,9 @@ def train(run, cfg, train_set, validation_set, device):
 
 def against_passes(estimator, data, cfg, device, world):
     """{M: sums of trajectories.measure} on the validation set; without dropout for M = 1, as every pass is the same."""
-    def sums(m):
-        def predict(o):
-            return estimator.predict(o, passes=m)[:2]
-
-        return trajectories.measure(data, cfg.validation, cfg.sequences, 3, device, predict, world)
-
-    return {m: sums(m) for m in (GRID if estimator.dropout else (1,))}
+    return {m: trajectories.measure(data, cfg.validation, cfg.sequences, 3, device,
+                                    lambda o, m=m: estimator.predict(o, passes=m)[:2], world)
+            for m in (GRID if estimator.dropout else (1,))}
 
 
 def main(cfg):

@@ -80,7 +80,9 @@ def inputs_of(cfg):
     if cfg.warm_start and (sizes := weights.load(networks.Recurrent, paths["policy"]).sizes) != cfg.sizes:
         raise UserError(f"--sizes {cfg.sizes}: pi_priv has {sizes}; use those, or --no-warm-start")
     if kind := TRAINED[cfg.method].estimator:
-        paths |= {f"estimator{i or ''}": path for i, path in enumerate(stacks.find_estimator(cfg, kind))}
+        nets_of = stacks.find_estimator(cfg, kind)
+        stacks.load_estimator(kind, nets_of)
+        paths |= {f"estimator{i or ''}": path for i, path in enumerate(nets_of)}
     return paths or nets("policy")  # what reads no net has pi_priv's world all the same
 
 
@@ -93,7 +95,7 @@ def start_from(net, trained, first=0):
 
 
 def train_rl(run, cfg, paths, device):
-    """Recurrent PPO on the method's stack (sec. 3.3). Returns the policy, None when the time limit stopped it."""
+    """Recurrent PPO on the method's stack (sec. 3.3). False when the time limit stopped it."""
     method = TRAINED[cfg.method]
     nets = [path for name, path in paths.items() if name.startswith("estimator")]
     estimator = stacks.load_estimator(method.estimator, nets, device) if nets else None
@@ -106,11 +108,14 @@ def train_rl(run, cfg, paths, device):
     if cfg.warm_start:
         start_from(pi, weights.load(networks.Recurrent, paths["policy"], device))
         start_from(critic, weights.load(networks.Recurrent, paths["value"], device), seen if cfg.privileged_critic else 0)
-    return pi if training.train(run, cfg, env, held_out, pi, critic) else None
+    done = training.train(run, cfg, env, held_out, pi, critic)
+    if done and not ranks.RANK:
+        weights.save(run.dir / "policy.safetensors", pi)
+    return done
 
 
 def train_bc(run, cfg, paths, device):
-    """Behaviour cloning of pi_priv on its own trajectories (appendix B.3): the student of the lowest validation loss."""
+    """Behaviour cloning of pi_priv on its own trajectories (appendix B.3). False when the time limit stopped it."""
     teacher = weights.load(networks.Recurrent, paths["policy"], device)
     torch.manual_seed(cfg.seed)
     student = networks.policy(9, cfg.sizes).to(device)
@@ -127,12 +132,11 @@ def train_bc(run, cfg, paths, device):
             logp = networks.log_softmax(student(o)[0])
         return (-(target * logp).sum((-1, -2)) * mask).sum() / mask.sum()
 
-    done = supervised.fit(
+    return supervised.fit(
         run, student, loss, lambda: weights.save(run.dir / "policy.safetensors", student),
         trajectories.load_set(cfg, "teacher_train")[0], trajectories.load_set(cfg, "teacher_validation")[0],
         seed=cfg.seed, sequences=cfg.bc_sequences, epochs=cfg.bc_epochs, lr=cfg.bc_lr, lr_end=cfg.bc_lr_end,
         grad_norm=cfg.grad_norm, validation=cfg.bc_validation)
-    return weights.load(networks.Recurrent, run.dir / "policy.safetensors", device) if done else None
 
 
 def main(cfg):
@@ -143,12 +147,10 @@ def main(cfg):
         run = runs.Run(cfg, "04_train_policy", paths, method, settings_of(cfg))
         if run.skip():
             continue
-        pi = (train_bc if cloning else train_rl)(run, cfg, paths, device)
-        if pi is None:
+        if not (train_bc if cloning else train_rl)(run, cfg, paths, device):
             return
         if ranks.RANK:
             continue
-        weights.save(run.dir / "policy.safetensors", pi)
         if cloning:
             plots.validation_loss(cfg.roots, "bc_loss", run.dir / "bc_loss.png")
             run.finish(["policy.safetensors"], **supervised.outcome(run))

@@ -32,22 +32,22 @@ class Config(command.Reader):
     switch_episodes: int = 20_000  # episodes for the contact switches (sec. 5.4)
     passes: int = 50  # M, stochastic passes of the estimator in the loop (sec. 4)
     other_episodes: int | None = 1000  # episodes for each policy in each of the other worlds; none: these are left out
-    # trajectories of each kind for the particle filter, half of its episodes in the loop; none: it is left out
+    # trajectories of each kind that the particle filter is measured on, half as many as its episodes; none: it is left out
     filter_trajectories: int | None = command.setting(100, before=None)
     particles: int = 1000  # of the filter
     test: int = 150_000  # most trajectories of the test set (appendix B.2)
     test_passes: int = 50  # M on the test set
-    num_envs: int = 2000  # worlds at once: so many episodes of the list share a seed, so another number is another list
+    num_envs: int = 1000  # worlds at once: so many episodes of the list share a seed, so another number is another list
 
 
 PRESETS = {
-    "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, other_episodes=100, passes=10, num_envs=200,
+    "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, other_episodes=100, passes=10, num_envs=100,
                        filter_trajectories=None, weights=Path(__file__).parent / "pretrained"),
     "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, other_episodes=None, passes=2, test=12,
                   num_envs=16, filter_trajectories=1, particles=10),
     "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, other_episodes=300, passes=20, test=2000, num_envs=300,
                   filter_trajectories=20, particles=300),
-    "laptop": dict(switch_episodes=2000, passes=10, num_envs=1000),
+    "laptop": dict(switch_episodes=2000, passes=10),
     "paper": {},
 }
 
@@ -88,7 +88,7 @@ def estimator_errors(cfg, players, test, name):
     section, *row, kind = name.split("/")
     data, limit, size = test, cfg.test, 100
     if section == "filter":
-        data, limit, size = test if row == ["test"] else players.unsure(*row), cfg.filter_trajectories, 1
+        data, limit, size = test if row == ["test"] else players.trajectories(*row), cfg.filter_trajectories, 1
     estimator = players.estimator(None if kind == "vision" else kind)
     progress = bar(min(limit, len(data[1]) - 1), name, unit="trajectory")
 
@@ -155,7 +155,8 @@ def draw(run, players, results, done):
         if {*methods} & {*results["estimator_ablation"], *results["success_rate"]}:
             plots.validation_loss(cfg.roots, name, run.dir / f"{name}.png")
     plots.sim(run.dir / "sim.png", players.world)
-    plots.calibration(results, run.dir / "calibration.png")
+    if any("calibration" in row for row in results["estimator_ablation"].values()):
+        plots.calibration(results, run.dir / "calibration.png")
     if results["other_worlds"]:
         plots.other_worlds(results, run.dir / "other_worlds.png")
     if results["occlusion_duration"]:
@@ -183,6 +184,8 @@ def draw(run, players, results, done):
 def main(cfg):
     if cfg.filter_trajectories and cfg.particles < particles.LEAST:
         raise UserError(f"--particles {cfg.particles}: say {particles.LEAST} or more")
+    if cfg.seed >= 2**22:
+        raise UserError(f"--seed {cfg.seed}: say less than {2**22}")
     device = command.device_of(cfg)
     estimators, policies, left_out = trained(cfg)
     test, test_paths = trajectories.load_set(cfg, "test")
@@ -212,7 +215,6 @@ def main(cfg):
         return
     done = {name: kept[key] for name, key in keys.items()}
     results = statistics.summarise(done)
-    save_json(run.dir / "results.json", results)
     write_atomic(run.dir / "tables.md", lambda path: path.write_text(tables.every(results)))
     save_json(run.dir / "results.json", results | draw(run, players, results, done))
     run.finish(["results.json", "tables.md"])

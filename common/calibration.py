@@ -1,5 +1,6 @@
 """Is sigma true? Coverage, NLL, CRPS and NEES of predicted Gaussians, and whether sigma foresees a failure."""
 import math
+from statistics import NormalDist
 
 import numpy as np
 import torch
@@ -8,31 +9,36 @@ from common import task
 
 UNITS = np.array([1e3, 1e3, np.rad2deg(1)])  # x, y in mm, theta in degrees
 LEVELS = (0.25, 0.5, math.erf(1 / 2**0.5), 0.8, 0.9, math.erf(2 / 2**0.5))  # of central intervals; 1 and 2 sigma among them
-BOUNDS = (2**0.5 * torch.special.erfinv(torch.tensor(LEVELS, dtype=torch.float64))).tolist()  # the same in sigmas
+BOUNDS = [NormalDist().inv_cdf((1 + level) / 2) for level in LEVELS]  # the same in sigmas
 EDGES = np.geomspace(1, 32, 6)  # mm, of sigma in x and y together: error against sigma
 AGES = range(11)  # s since the box was last seen
-HORIZON = 2 * task.RATE  # steps within which a failure is to be foreseen
+SOON = 2 * task.RATE  # steps within which a failure is to be foreseen
 TALLIES = ("calibration", "scaled")  # of the predicted sigma, and of it times the scale that the validation set gave
 PARTS = {"steps": 1, "ratios": 4, "within": 3 * len(LEVELS), "nll": 3, "crps": 3, "count": len(EDGES) + 1,
-         "squares": len(EDGES) + 1, "variances": len(EDGES) + 1, "nees": len(AGES)}  # of a tally, and their widths
+         "squares": len(EDGES) + 1, "variances": len(EDGES) + 1, "aged": len(AGES), "nees": len(AGES)}  # of a tally: widths
+
+
+def pose_error(q_hat, q):
+    """Errors (..., 3) in m, m, rad of scaled poses (..., 4)."""
+    error = task.unscale_pose(q_hat) - task.unscale_pose(q)
+    error[..., 2] = task.wrap(error[..., 2])
+    return error
 
 
 def deviations(q_hat, variance, q):
     """Errors and standard deviations (..., 3) of x, y (mm) and theta (degrees) from scaled poses (..., 4).
 
-    theta = atan2(sin, cos) has to first order the variance (cos^2 var_sin + sin^2 var_cos) / (sin^2 + cos^2)^2.
+    The truth lies on the unit circle, so the errors of sin and cos are those of one turn and far from independent: to first
+    order theta has the variance (var_sin + var_cos) / (sin^2 + cos^2).
     """
-    error = task.unscale_pose(q_hat) - task.unscale_pose(q)
-    error[..., 2] = task.wrap(error[..., 2])
-    turned, length = np.square(q_hat[..., [3, 2]]) * variance[..., 2:], np.square(q_hat[..., 2:]).sum(-1)
-    sigma = np.concatenate([np.sqrt(variance[..., :2]) * task.HALF, (np.sqrt(turned.sum(-1)) / length)[..., None]], -1)
-    return UNITS * error, UNITS * sigma
+    turned = variance[..., 2:].sum(-1, keepdims=True) / np.square(q_hat[..., 2:]).sum(-1, keepdims=True)
+    return UNITS * pose_error(q_hat, q), UNITS * np.sqrt(np.concatenate([variance[..., :2] * task.HALF**2, turned], -1))
 
 
 def tally(q_hat, variance, q, occluded, mask):
     """What `summary` needs of each trajectory, (B, sum of PARTS), from poses and variances (T, B, 4), flags and mask (T, B).
 
-    Sums over the valid steps; of the NEES, e^T P^-1 e of (x, y, theta), one value at each of AGES, nan where there is none.
+    Sums over the valid steps; of the NEES, e^T P^-1 e of (x, y, theta), over those at each of AGES.
     """
     error, sigma = deviations(q_hat, variance, q)
     z, mask = np.abs(error) / sigma, mask > 0
@@ -42,13 +48,11 @@ def tally(q_hat, variance, q, occluded, mask):
     bins = np.digitize(spread, EDGES)[..., None] == np.arange(len(EDGES) + 1)
     steps = np.arange(len(mask))[:, None]
     age = steps - np.maximum.accumulate(np.where(occluded > 0, 0, steps))
-    reached = (age[..., None] == task.RATE * np.array(AGES)) & mask[..., None]
-    nees = np.take_along_axis(np.square(z).sum(-1)[..., None], reached.argmax(0)[None], 0)[0]
+    aged = age[..., None] == task.RATE * np.array(AGES)
     terms = [np.ones_like(spread)[..., None], np.square(q_hat - q) / variance,
              np.concatenate([z <= bound for bound in BOUNDS], -1), z**2 / 2 + np.log(2 * np.pi * sigma**2) / 2, crps,
-             bins, bins * off[..., None]**2, bins * spread[..., None]**2]
-    sums = [(term * mask[..., None]).sum(0) for term in terms]
-    return np.concatenate([*sums, np.where(reached.any(0), nees, np.nan)], 1)
+             bins, bins * off[..., None]**2, bins * spread[..., None]**2, aged, aged * np.square(z).sum(-1)[..., None]]
+    return np.concatenate([(term * mask[..., None]).sum(0) for term in terms], 1)
 
 
 def parts(tallies):
@@ -63,7 +67,9 @@ def scale(tallies):
 
 
 def bootstrap(statistic, count, draws=200):
-    """Mean with its 95 % interval of statistic(weights (count,)), how often each of `count` independent ones is drawn."""
+    """statistic(weights (count,)) with all weights 1, and its 95 % interval where they tell how often each of `count`
+    independent ones was drawn; what a draw cannot tell is nan.
+    """
     rng = np.random.default_rng(0)
     values = [statistic(rng.multinomial(count, np.full(count, 1 / count))) for _ in range(draws)]
     low, high = np.nanpercentile(values, (2.5, 97.5), axis=0)
@@ -72,18 +78,25 @@ def bootstrap(statistic, count, draws=200):
 
 def summary(tallies):
     """Calibration of tallies (N, sum of PARTS): shares within 1 and 2 sigma, NLL and CRPS of x, y (mm), theta (degrees);
-    the curve, {level: shares}; of bins of sigma (mm) the root mean square error (mm); and the NEES / 3 at AGES, 1 if true.
+    the curve, {level: shares}; of bins of sigma (mm) the root mean square error (mm); and the NEES / 3, 1 if true, at those of
+    AGES that there are, each of so many trajectories.
     """
     sums = parts(tallies)
-    steps, nees = sums["steps"].sum(), sums["nees"] / 3
+    steps, ages = sums["steps"].sum(), sums["aged"].any(0).sum()  # who comes to 3 s came to 2 s
+    aged, nees = sums["aged"][:, :ages], sums["nees"][:, :ages] / 3
     curve = (sums["within"].sum(0) / steps).reshape(-1, 3).tolist()
-    count, there = np.maximum(sums["count"].sum(0), 1), np.isfinite(nees)
-    weighted = bootstrap(lambda w: w @ np.where(there, nees, 0) / np.maximum(w @ there, 1), len(nees))
+    count = np.maximum(sums["count"].sum(0), 1)
+
+    def mean_nees(weights):
+        told = weights @ aged
+        return np.divide(weights @ nees, told, out=np.full(ages, np.nan), where=told > 0)
+
     return {"within_1_sigma": curve[2], "within_2_sigma": curve[5]} | {
         name: (sums[name].sum(0) / steps).tolist() for name in ("nll", "crps")} | {
         "curve": dict(zip(map("{:.3f}".format, LEVELS), curve)), "steps": sums["count"].sum(0).tolist(),
         **{f"{name}_mm": np.sqrt(sums[of].sum(0) / count).tolist() for name, of in (("sigma", "variances"), ("rmse", "squares"))},
-        "nees": {name: np.asarray(x).tolist() for name, x in weighted.items()}, "nees_count": there.sum(0).tolist()}
+        "nees": {name: x.tolist() for name, x in bootstrap(mean_nees, len(nees)).items()},
+        "nees_count": (aged > 0).sum(0).tolist()}
 
 
 def course(variance, length, success):
@@ -115,7 +128,7 @@ def foreseen(courses):
     seconds = np.arange(sigma.shape[1])
     episode, second = np.nonzero((task.RATE * seconds < length[:, None]) & (seconds > 0))
     now = sigma[episode, second]
-    label = left[episode] * (length[episode] - task.RATE * second <= HORIZON)
+    label = left[episode] * (length[episode] - task.RATE * second <= SOON)
     if not 0 < label.sum() < len(label):
         return None
     scores = {"sigma": now, "rise": now - sigma[episode, second - 1], "time": second}

@@ -75,5 +75,4 @@ def other_worlds(world):
 
 def of_sensing(other, world):
     """Whether a world of other_worlds differs from `world` in what only an observation knows."""
-    base = Other(**asdict(world))
-    return any(getattr(other, name) != getattr(base, name) for name in SENSING)
+    return any(getattr(other, name) != getattr(world, name) for name in SENSING)

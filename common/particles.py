@@ -27,17 +27,19 @@ class Filter:
             raise ValueError(f"{num} particles: say {LEAST} or more")
         self.num, self.world, self.rng = num, world, np.random.default_rng(seed)
         self.worlds = Worlds(num, size=world.box)
-        self.noise, self.prior = (np.square(x) for x in (world.noise, world.bias))  # variances of x, y, theta, force x, y
+        # variances of x, y, theta, force x, y; a sensor without noise has next to none
+        self.noise, self.prior = (np.maximum(np.square(x), 1e-12) for x in (world.noise, world.bias))
+        self.log_weight = np.zeros(num)
 
-    def begin(self, o):
-        """Mean and variance (4,) at an episode's first observation (9,)."""
+    def begin(self, o, parts=slice(None)):
+        """Mean and variance (4,) at an episode's first observation (9,), of which only `parts` tell of the bias."""
         seen, pusher = self._measured(o)
         spread = np.sqrt(self.noise + self.prior)[:3]
         box = seen[:3] + spread * self.rng.standard_normal((self.num, 3))
         self._place(box, pusher, self.world.draw(self.rng, self.num))
-        self.log_weight = np.zeros(self.num)
         self.bias, self.variance = np.zeros((self.num, 5)), np.tile(self.prior, (self.num, 1))
-        self._weigh(seen - np.concatenate([box, np.zeros((self.num, 2))], 1), self.noise, slice(None), 0.0)
+        self._weigh(seen - np.concatenate([box, np.zeros((self.num, 2))], 1), self.noise[parts], parts)
+        self.log_weight = np.zeros(self.num)  # the poses were drawn by this very likelihood
         return self._told()
 
     def step(self, o):
@@ -50,7 +52,7 @@ class Filter:
         if not o[8]:
             off = error[:, :3] - self.bias[:, :3]
             if (off**2 / (self.noise + self.variance)[:, :3]).sum(1).min() > LOST:
-                return self.begin(o)
+                return self.begin(o, slice(0, 3))  # the force is that of a box in contact
             self._weigh(error, self.noise[:3], slice(0, 3))
         self._weigh(error, self.noise[3:] + (MODEL * worlds.force)**2, slice(3, 5))
         if 1 / np.square(self._weights()).sum() < self.num / 2:
@@ -62,10 +64,10 @@ class Filter:
         o = o.astype(float)
         return np.concatenate([task.unscale_pose(o[:4]), o[6:8] * self.world.max_force]), o[4:6] * task.HALF
 
-    def _weigh(self, error, noise, parts, share=1.0):
-        """Weighs the particles by errors (N, 5) of their `parts`, to the power of `share`, and corrects their biases."""
+    def _weigh(self, error, noise, parts):
+        """Weighs the particles by errors (N, 5) of their `parts`, and corrects their biases."""
         off, total = (error - self.bias)[:, parts], self.variance[:, parts] + noise
-        self.log_weight -= share * (off**2 / total + np.log(total)).sum(1) / 2
+        self.log_weight -= (off**2 / total + np.log(total)).sum(1) / 2
         gain = self.variance[:, parts] / total
         self.bias[:, parts] += gain * off
         self.variance[:, parts] *= 1 - gain
@@ -75,7 +77,7 @@ class Filter:
         return weights / weights.sum()
 
     def _resample(self, pusher):
-        """Systematic resampling; what is drawn again moves a little, its dynamics within their ranges."""
+        """Systematic resampling; what is drawn again moves a little, its dynamics within their ranges (a square: the support)."""
         points = (self.rng.random() + np.arange(self.num)) / self.num
         chosen = np.searchsorted(self._weights().cumsum(), points).clip(max=self.num - 1)
         worlds, far, dynamics = self.worlds, self.world.support_offset[1], {}
@@ -98,7 +100,7 @@ class Filter:
 
 
 class Filters:
-    """A Filter a trajectory, in the place of an estimator."""
+    """A Filter a trajectory, in the place of an estimator; in a loop one world at a time. Seeded by torch's draws."""
 
     def __init__(self, num, world=task.World()):
         self.num, self.world = num, world
@@ -108,7 +110,7 @@ class Filters:
 
     def predict(self, o, hidden=None, passes=None):
         """As networks.Estimator.predict; the hidden state is the filters."""
-        filters = hidden or [Filter(self.num, self.world) for _ in range(o.shape[1])]
+        filters = hidden or [Filter(self.num, self.world, seed) for seed in torch.randint(2**62, (o.shape[1],)).tolist()]
         told = [[f.step(x) if hidden or t else f.begin(x) for f, x in zip(filters, row)]
                 for t, row in enumerate(o.cpu().numpy())]
         return *torch.as_tensor(np.array(told), dtype=torch.float32).unbind(2), filters

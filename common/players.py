@@ -17,7 +17,7 @@ class Players:
     def __init__(self, cfg, paths, device, world=World()):
         self.cfg, self.paths, self.device, self.world = cfg, paths, device, world
         self.policy = cache(lambda m, seed: weights.load(networks.Recurrent, paths[m, seed], device))
-        self.estimator, self.unsure = cache(self.estimator), cache(self.unsure)
+        self.estimator, self.trajectories = cache(self.estimator), cache(self.trajectories)
 
     def estimator(self, kind):
         """Of none, none; "filter" is the particle filter."""
@@ -46,15 +46,15 @@ class Players:
             told = trajectories.in_the_loop(env.rows, length, success, scale)
         return told[:m.episodes - number * m.width(self.cfg)]
 
-    def unsure(self, row):
+    def trajectories(self, row):
         """Trajectories of pi_priv on drifting poses, in one of `other_worlds` or, as "drifting", in the nets'."""
-        world = measurements.other_worlds(self.world).get(row, self.world)
+        world = self.world if row == "drifting" else measurements.other_worlds(self.world)[row]
         count, seed = self.cfg.filter_trajectories, LIST * (1 + self.cfg.seed)
         states, length, _ = collection.collect(self.policy("priv_on_state", 0), world, count, seed, count)
         return states, np.concatenate([[0], length]).cumsum()
 
     def episode(self, m, index):
         """Episode `index` of the list: states, observations, beliefs and success."""
-        number, world = divmod(index, self.cfg.num_envs)
+        number, world = divmod(index, m.width(self.cfg))
         success, length, env = self.chunk(m, number)
         return env.episode(world, length[world]) | {"success": bool(success[world])}

@@ -10,7 +10,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 
 from common import draw, env, runs, task
 from common.files import write_atomic
-from common.stacks import ESTIMATORS, METHODS
+from common.stacks import ESTIMATORS, METHODS, TRAINED
 
 matplotlib.rcParams.update({
     "font.size": 10, "axes.titlesize": 10.5, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
@@ -22,8 +22,8 @@ COLOURS = ("#0072B2", "#56B4E9", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#4
            "#332288", "#117733", "#882255")
 SUCCESS_AXIS = {"ylabel": "success rate (%)", "ylim": (-2, 102)}  # the y axis of success rates
 LOSSES = {  # figure: stage, methods, what is on the y axis
-    "likelihood_loss": ("03_train_estimator", [m for m, kind in ESTIMATORS.items() if kind.likelihood], "loss (eq. 1)"),
-    "mse_loss": ("03_train_estimator", [m for m, kind in ESTIMATORS.items() if not kind.likelihood], "mean squared error"),
+    "likelihood_loss": ("03_train_estimator", [m for m, kind in TRAINED.items() if kind.likelihood], "loss (eq. 1)"),
+    "mse_loss": ("03_train_estimator", [m for m, kind in TRAINED.items() if not kind.likelihood], "mean squared error"),
     "bc_loss": ("04_train_policy", [m for m, method in METHODS.items() if method.training == "cloning"], "cross-entropy")}
 
 
@@ -193,7 +193,7 @@ def calibration(results, path):
     """
     summaries = {style(kind)[:2]: e["calibration"] for kind, e in results["estimator_ablation"].items() if "calibration" in e}
     if loop := results.get("in_the_loop", {}).get("est_uncertainty"):
-        summaries["ours, in the loop", "0.3"] = loop["calibration"]
+        summaries[f"{METHODS['est_uncertainty'].estimator}, in the loop", "0.3"] = loop["calibration"]
     figure, (curve, errors, nees) = new(11, 3.7, 1, 3)
     for (label, color), c in summaries.items():
         levels = [0, *map(float, c["curve"]), 1]
@@ -204,9 +204,8 @@ def calibration(results, path):
         mean, low, high = (np.array(c["nees"][name])[told] for name in ("mean", "low", "high"))
         nees.plot(told, mean, color=color)
         nees.fill_between(told, low, high, color=color, alpha=0.2, lw=0)
-    limits = errors.get_xlim()
-    for ax, line in ((curve, (0, 1)), (errors, limits)):
-        ax.plot(line, line, color="0.5", lw=1, ls=":")
+    for ax in (curve, errors):
+        ax.axline((0, 0), slope=1, color="0.5", lw=1, ls=":")
     nees.axhline(1, color="0.5", lw=1, ls=":")
     curve.set(xlabel="central interval of the predicted Gaussian", ylabel="share of x, y, theta within")
     errors.set(xlabel="sigma in x, y (mm)", ylabel="root mean square error (mm)")

@@ -25,8 +25,8 @@ class EstimatorKind:
     """A state estimator of stage 03 (tab. estimator_ablation)."""
 
     label: str
-    likelihood: bool  # trained with eq. 1, else with the mean squared error
-    dropout: bool  # MC dropout in training and use
+    likelihood: bool = True  # trained with eq. 1, else with the mean squared error
+    dropout: bool = True  # MC dropout in training and use
     nets: tuple[tuple[str, int], ...] = ()  # (kind, seed) of what it is an ensemble of; none: it is trained itself
     scaled: bool = False  # by their scales
 
@@ -42,7 +42,8 @@ class Method:
     published: bool = True  # by the paper; the others are trained when they are named
 
     def __post_init__(self):
-        if (self.reads in ("s", "o")) != (self.estimator is None) or self.reads not in {
+        known, needed = self.estimator in (None, *ESTIMATORS), self.reads not in ("s", "o")
+        if not known or needed != (self.estimator is not None) or self.reads not in {
                 "pi_priv": ("s", "s_hat"), "cloning": ("o",), "rl": ("o", "s_hat", "s_hat, sigma")}[self.training]:
             raise ValueError(f"{self}: no stack of these wrappers")
 
@@ -51,8 +52,8 @@ ESTIMATORS = {
     "ours": EstimatorKind("ours (likelihood + MC dropout)", likelihood=True, dropout=True),
     "likelihood": EstimatorKind("likelihood loss", likelihood=True, dropout=False),
     "mse": EstimatorKind("MSE loss", likelihood=False, dropout=False),
-    "ensemble": EstimatorKind("three of likelihood loss", True, False, nets=tuple(("likelihood", k) for k in range(3))),
-    "ours_scaled": EstimatorKind("ours, scaled", True, True, nets=(("ours", 0),), scaled=True),
+    "ensemble": EstimatorKind("three of likelihood loss", nets=tuple(("likelihood", k) for k in range(3))),
+    "ours_scaled": EstimatorKind("ours, scaled", nets=(("ours", 0),), scaled=True),
 }
 METHODS = {
     "est_uncertainty": Method(r"$\pi_{est}(\hat{s}, \hat{\Sigma})$", "s_hat, sigma", "ours", "rl"),
@@ -79,7 +80,7 @@ def load_estimator(kind, paths, device="cpu"):
     """A kind of estimator from the paths of its nets. Raises UserError: a scale is asked for that is not known."""
     nets = [weights.load(networks.Estimator, path, device) for path in paths]
     if ESTIMATORS[kind].scaled and None in [net.scale for net in nets]:
-        raise UserError(f"{paths[0]} is of before its sigma was scaled: rerun 03_train_estimator.py with --force")
+        raise UserError(f"{paths[0]} has no scale of its sigma: train it anew with 03_train_estimator.py, or take newer weights")
     return networks.Ensemble(nets, ESTIMATORS[kind].scaled) if ESTIMATORS[kind].nets else nets[0]
 
 

@@ -27,7 +27,7 @@ def paired(values, reference):
 def errors(sums):
     """Row of tab. estimator_ablation from sums (5, N) of trajectories.pose_errors: ERRORS in mm and degrees, and half_95."""
     unit = np.array([1e3, 1e3 / math.sqrt(2), np.rad2deg(1), np.rad2deg(1)])  # the paper's RMSE in mm is per axis
-    steps = max(sums[0].sum(), 1)
+    steps = sums[0].sum()
     mean = sums[1:].sum(1) / steps
     half = Z * np.linalg.norm(sums[1:] - mean[:, None] * sums[0], axis=1) / steps  # only trajectories are independent
     mean[[1, 3]] **= 0.5
@@ -36,8 +36,8 @@ def errors(sums):
 
 
 def error_table(sums):
-    """`errors` over all steps and, below "seen" and "occluded", over those; and whether sigma is true."""
-    return errors(sums["all"]) | {name: errors(sums[name]) for name in ("seen", "occluded")} | {
+    """`errors` over all steps and, below "seen" and "occluded", over those that there are; and whether sigma is true."""
+    return errors(sums["all"]) | {name: errors(sums[name]) for name in ("seen", "occluded") if sums[name][0].any()} | {
         name: calibration.summary(sums[name].T) for name in calibration.TALLIES if name in sums}
 
 
@@ -67,7 +67,7 @@ def summarise(done):
         rows[last] = kinds.get(keys[0], wilson)(values)
     vision = results["estimator_ablation"]["vision"]
     for row in results["estimator_ablation"].values():
-        row |= {f"{key}_of_vision": row[key] / vision[key] for key in (ERRORS[0], ERRORS[2])}
+        row |= {f"{key}_of_vision": row[key] / vision[key] for key in (ERRORS[0], ERRORS[2]) if vision[key]}
     results["occlusion_loss"] = {method: paired(*(done[f"occlusion_duration/{method}/{name}"] for name in ("0", "full")))
                                  for method in results["occlusion_duration"]}
     reference = done.get("success_rate/est_uncertainty/0")

@@ -47,19 +47,19 @@ def beside_paper(results):
     for method, s in results.get("contact_switches", {}).items():
         mean = within(s["mean"], Z * s["std"] / math.sqrt(s["episodes"]))
         rows.append([f"contact switches of {method}, mean +- std", f"{mean} +- {s['std']:.2f}", paper.SWITCHES[method]])
-    return "Beside the paper, with 95 % intervals\n\n" + aligned(["number", "here", "paper"], rows)
+    return titled("Beside the paper, with 95 % intervals", ["number", "here", "paper"], rows)
 
 
 def estimator_ablation(results):
     """Tab. estimator_ablation, with the share of the vision baseline and the errors where the box is seen and occluded."""
     rows, means = [], (ERRORS[0], ERRORS[2])
     for kind, e in results["estimator_ablation"].items():
-        share = ", ".join(f"{e[f'{key}_of_vision']:.1%}" for key in means)
-        parts = [", ".join(f"{e[part][key]:.2f}" for key in means) for part in ("seen", "occluded")]
+        share = ", ".join(f"{e[f'{key}_of_vision']:.1%}" for key in means if f"{key}_of_vision" in e)
+        parts = [", ".join(f"{e[part][key]:.2f}" for key in means) if part in e else "" for part in ("seen", "occluded")]
         rows.append([kind, *(f"{e[key]:.2f}" for key in ERRORS), share, *parts])
     title = "Errors of the estimators on the test set (tab. estimator_ablation); in pairs: mean L2 (mm), mean abs. (deg)"
     header = ["estimator", "L2 (mm)", "RMSE (mm)", "abs. (deg)", "RMSE (deg)", "of vision", "seen", "occluded"]
-    return f"{title}\n\n{aligned(header, rows)}"
+    return titled(title, header, rows)
 
 
 def in_the_loop(results):
@@ -76,8 +76,8 @@ def calibrated(results):
         for key in calibration.TALLIES:
             if told := e.get(key):
                 shares = [", ".join(f"{100 * x:.0f}" for x in told[f"within_{k}_sigma"]) for k in (1, 2)]
-                nees = [told["nees"]["mean"][age] for age in (0, 3, 10)]
-                scores = [", ".join(f"{x:.2f}" for x in values) for values in (told["nll"], told["crps"], nees)]
+                nees = [told["nees"]["mean"][age:age + 1] for age in (0, 3, 10)]
+                scores = [", ".join(f"{x:.2f}" for x in values) for values in (told["nll"], told["crps"], sum(nees, []))]
                 rows.append([f"{name}{', scaled' * (key == 'scaled')}", *shares, *scores])
     title = "Calibration of x, y (mm) and theta (degrees), of estimators on the test set and in the loops of policies"
     return titled(title, ["sigma of", "1 (68 %)", "2 (95 %)", "NLL", "CRPS", "NEES / 3: seen, 3 s, 10 s after"], rows)
@@ -115,19 +115,19 @@ def success_rate(results):
         rows.append([method, percent(r), points(difference, "+") if difference else "", seeds])
     header = ["method", "success [95 %]", "minus est_uncertainty, paired", "mean +- std (seeds)"]
     episodes = results["success_rate"]["priv_on_state"]["episodes"]
-    return f"Success on the fixed list of {episodes:,} episodes (sec. 5.2)\n\n" + aligned(header, rows)
+    return titled(f"Success on the fixed list of {episodes:,} episodes (sec. 5.2)", header, rows)
 
 
 def occlusion_duration(results):
     """The numbers of fig. occlusion_duration."""
     sweep = results["occlusion_duration"]
     if not sweep:
-        return "No method that reads an observation was measured"
+        return ""
     rows = [[method, *map(percent, rates.values())] for method, rates in sweep.items()]
     rates = next(iter(sweep.values()))
     header = ["method", *({"0": "none", "full": "full"}.get(name, f"{name} s") for name in rates)]
     title = f"Success by occlusion duration, {rates['0']['episodes']:,} episodes a point (fig. occlusion_duration)"
-    return title + "\n\n" + aligned(header, rows)
+    return titled(title, header, rows)
 
 
 def other_worlds(results):
@@ -140,7 +140,7 @@ def other_worlds(results):
             for row, rates in ({"as trained": results["success_rate"]} | worlds).items()]
     episodes = next(iter(worlds.values()))[methods[0]]["episodes"]
     title = f"Success in other worlds, one thing changed at a time, {episodes:,} episodes each"
-    return f"{title}\n\n{aligned(['world', *methods], rows)}"
+    return titled(title, ["world", *methods], rows)
 
 
 def further(results):

@@ -74,10 +74,8 @@ def pose_errors(q_hat, q, occluded, mask):
 
     {"all" | "seen" | "occluded": (5, B) sums of (1, |d_xy|, |d_xy|^2, |d_theta|, d_theta^2) in m and rad}.
     """
-    q_hat, q = (task.unscale_pose(x.double().cpu().numpy()) for x in (q_hat, q))
-    occluded, mask = occluded.cpu().numpy() > 0, mask.cpu().numpy() > 0
-    l2 = np.linalg.norm(q_hat[..., :2] - q[..., :2], axis=-1)
-    angle = np.abs(task.wrap(q_hat[..., 2] - q[..., 2]))
+    error, occluded, mask = calibration.pose_error(q_hat, q), occluded > 0, mask > 0
+    l2, angle = np.hypot(*np.moveaxis(error[..., :2], -1, 0)), np.abs(error[..., 2])
     terms = np.stack([np.ones_like(l2), l2, l2**2, angle, angle**2])
     steps = {"all": mask, "seen": mask & ~occluded, "occluded": mask & occluded}
     return {name: (terms * chosen).sum(1) for name, chosen in steps.items()}
@@ -85,9 +83,9 @@ def pose_errors(q_hat, q, occluded, mask):
 
 def compared(q_hat, variance, q, occluded, mask, scale=None):
     """`pose_errors`, and of estimates that tell a variance (T, B, 4) calibration's tallies (., B), also of it scaled."""
+    q_hat, q = q_hat.astype(float), q.astype(float)
     told = pose_errors(q_hat, q, occluded, mask)
     if variance is not None and variance.any():
-        q_hat, variance, q, occluded, mask = (x.double().cpu().numpy() for x in (q_hat, variance, q, occluded, mask))
         told |= {name: calibration.tally(q_hat, variance * np.square(factors), q, occluded, mask).T
                  for name, factors in zip(calibration.TALLIES, ([1.0], scale)) if factors}
     return told
@@ -100,9 +98,9 @@ def in_the_loop(rows, length, success, scale=None):
     state, o, belief = (np.stack([row[name] for row in rows[:length.max()]]) for name in ("state", "o", "belief"))
     q = symmetry.mirror(task.scale(state), symmetry.signs(o[0]))[..., :4]
     mask, variance = (np.arange(len(q))[:, None] < length).astype(np.float32), np.square(belief[..., 8:])
-    told = compared(*map(torch.as_tensor, (belief[..., :4], variance, q, o[..., 8], mask)), scale)
+    told = compared(belief[..., :4], variance, q, o[..., 8], mask, scale)
     parts = {name: told[name].T.tolist() for name in ("all", *calibration.TALLIES) if name in told}
-    if len(parts) > 1:
+    if "calibration" in parts:
         parts["course"] = calibration.course(variance, length, success).tolist()
     return [dict(zip(parts, values)) for values in zip(*parts.values())]
 
@@ -119,8 +117,9 @@ def measure(data, limit, size, seed, device, predict, world=task.World(), scale=
         o, s, mask = observe(data, index, (seed, 0, k, 3), device, world)
         torch.manual_seed(int(np.random.SeedSequence([seed, k]).generate_state(1)[0]))
         with speed.autocast(device):
-            q_hat, variance = predict(o)
-        return compared(q_hat, variance, s[..., :4], o[..., 8], mask, scale)
+            told = predict(o)
+        arrays = [x if x is None else x.double().cpu().numpy() for x in (*told, s[..., :4], o[..., 8], mask)]
+        return compared(*arrays, scale)
 
     parts = ranks.spread([*enumerate(batches(subset(data, limit), size))], one)
     return {name: np.concatenate([part[name] for part in parts], 1) for name in (parts[0] if parts else ())}

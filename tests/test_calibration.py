@@ -10,12 +10,21 @@ T, B = 200, 400
 
 
 def drawn(factor=1.0, seed=0):
-    """Poses, variances and truths (T, B, 4) with Gaussian errors, whose sigma is `factor` times the one that is told."""
+    """Poses, variances and truths (T, B, 4) with Gaussian errors of x, y and theta, whose sigma is `factor` times what is told.
+
+    Angles where the sine or the cosine tells nothing of theta to first order are left out.
+    """
     rng = np.random.default_rng(seed)
-    angle = rng.uniform(-np.pi, np.pi, (T, B))
-    q_hat = np.concatenate([rng.uniform(-0.5, 0.5, (T, B, 2)), np.stack([np.sin(angle), np.cos(angle)], -1)], -1)
-    sigma = rng.uniform(0.01, 0.03, (T, B, 1)) * np.array([1, 1, 1, 1])
-    return q_hat, sigma**2, q_hat + factor * sigma * rng.standard_normal(q_hat.shape)
+    angle = rng.uniform(0.3, np.pi / 2 - 0.3, (T, B)) + np.pi / 2 * rng.integers(0, 4, (T, B))
+    sigma = rng.uniform(0.01, 0.03, (T, B, 1))
+    q_hat = np.concatenate([rng.uniform(-0.5, 0.5, (T, B, 2)), turned(angle)], -1)
+    variance = sigma**2 * np.concatenate([np.ones((T, B, 2)), turned(angle)[..., ::-1]**2], -1)
+    off = factor * sigma * rng.standard_normal((T, B, 3))
+    return q_hat, variance, np.concatenate([q_hat[..., :2] + off[..., :2], turned(angle + off[..., 2])], -1)
+
+
+def turned(angle):
+    return np.stack([np.sin(angle), np.cos(angle)], -1)
 
 
 def told(factor=1.0, occluded=None, mask=None, seed=0):
@@ -34,7 +43,7 @@ def test_a_true_sigma_is_called_true():
     assert summary["crps"] == pytest.approx(sigma.mean((0, 1)) / math.sqrt(math.pi), rel=0.02)  # E[CRPS] = sigma / sqrt(pi)
     assert summary["nll"] == pytest.approx((np.log(2 * np.pi * sigma**2).mean((0, 1)) + 1) / 2, abs=0.02)
     low, mean, high = (summary["nees"][name][0] for name in ("low", "mean", "high"))
-    assert low < mean < high < low + 0.3 and 0.85 < mean < 1.15 and summary["nees_count"] == [B] + [0] * 10
+    assert low < mean < high < low + 0.05 and 0.97 < mean < 1.03 and summary["nees_count"] == [B]
     assert np.array(summary["rmse_mm"])[1:4] == pytest.approx(np.array(summary["sigma_mm"])[1:4], rel=0.05)
 
 
@@ -49,17 +58,16 @@ def test_the_scale_makes_a_wrong_sigma_true(factor):
     assert calibration.summary(right)["within_1_sigma"] == pytest.approx([0.683] * 3, abs=0.01)
 
 
-def test_the_angles_sigma_is_that_of_its_sine_and_cosine_to_first_order():
+@pytest.mark.parametrize("spread", [0.03, 0.3])
+def test_the_angles_sigma_is_that_of_the_turns_that_its_sine_and_cosine_come_from(spread):
     rng = np.random.default_rng(0)
-    for angle, length in ((0.3, 1.0), (2.5, 0.8), (-1.2, 1.1)):
-        mean = np.array([0, 0, length * math.sin(angle), length * math.cos(angle)])
-        variance = np.array([1, 1, 0.02**2, 0.03**2])
-        sigma = calibration.deviations(mean, variance, mean)[1][2]
-        q = mean + np.sqrt(variance) * rng.standard_normal((20_000, 4))
-        assert np.rad2deg(np.std(task.wrap(np.arctan2(q[:, 2], q[:, 3]) - angle))) == pytest.approx(sigma, rel=0.03)
+    for angle in (0.0, 0.3, np.pi / 4, 2.5, -1.2):
+        q = np.concatenate([np.zeros((100_000, 2)), turned(angle + spread * rng.standard_normal(100_000))], 1)
+        sigma = calibration.deviations(q.mean(0), q.var(0), q[0])[1][2]
+        assert sigma == pytest.approx(np.rad2deg(spread), rel=0.03)
 
 
-def test_only_valid_steps_count_and_nees_has_one_value_a_time_since_the_last_sight():
+def test_only_valid_steps_count_and_nees_is_that_of_each_time_since_the_last_sight():
     occluded, mask = np.zeros((T, B)), np.ones((T, B))
     occluded[20:60] = occluded[100:140] = 1  # 40 frames: 2 whole seconds, twice
     mask[50:, 0] = 0
@@ -67,10 +75,11 @@ def test_only_valid_steps_count_and_nees_has_one_value_a_time_since_the_last_sig
     sums = calibration.parts(tallies)
     assert sums["steps"][:, 0].tolist() == [50] + [T] * (B - 1)
     assert sums["count"].sum(1).tolist() == [50] + [T] * (B - 1)
-    assert np.isfinite(sums["nees"]).sum(0).tolist() == [B, B, B] + [0] * 8
+    assert sums["aged"][1].tolist() == [T - 80, 2, 2] + [0] * 8 and sums["aged"][0].tolist() == [20, 1, 1] + [0] * 8
     q_hat, variance, q = drawn()
     error, sigma = calibration.deviations(q_hat, variance, q)
-    assert sums["nees"][5, 1] == pytest.approx(np.square(error / sigma)[19 + 15, 5].sum())
+    assert sums["nees"][5, 1] == pytest.approx(np.square(error / sigma)[[19 + 15, 99 + 15], 5].sum())
+    assert [len(x) for x in calibration.summary(tallies)["nees"].values()] == [3, 3, 3]
 
 
 def test_area_is_the_share_of_pairs_in_order():

@@ -254,5 +254,5 @@ def test_a_scale_is_kept_in_the_file(tmp_path):
     assert stacks.load_estimator("ours", paths).scale == net.scale and stacks.load_estimator("ours_scaled", paths).scaled
     net.scale = None
     weights.save(paths[0], net)
-    with pytest.raises(UserError, match="before its sigma was scaled: rerun 03_train_estimator.py with --force"):
+    with pytest.raises(UserError, match="has no scale of its sigma: train it anew"):
         stacks.load_estimator("ours_scaled", paths)

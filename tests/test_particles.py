@@ -1,13 +1,12 @@
 """The filter of simulated worlds, and the copies of worlds that it lives on."""
 import numpy as np
 import pytest
+import torch
 from test_simulator import play, random_pushes, start
 
 from common import particles, task
 from common.env import PushVectorEnv
 from common.observation import ObservationModel
-
-ALWAYS = 1e6  # s of occlusion
 
 
 def pushed(seed=0, steps=60):
@@ -58,7 +57,7 @@ def test_the_filter_follows_a_box_that_is_not_seen():
     errors, sights = [], []
     for seed in range(4):
         states = pushed(seed)
-        o = observed(states, ALWAYS, seed)
+        o = observed(states, 0.0, seed)
         o[1:, :4], o[1:, 8] = o[0, :4], 1  # never seen again
         mean = followed(o, seed=seed)[1]
         errors.append(off(mean, states)[-15:].mean())
@@ -68,7 +67,7 @@ def test_the_filter_follows_a_box_that_is_not_seen():
 
 def test_its_spread_grows_while_the_box_is_pushed_unseen_and_covers_the_truth():
     states = pushed()
-    o = observed(states, ALWAYS)
+    o = observed(states, 0.0)
     o[1:, :4], o[1:, 8] = o[0, :4], 1
     f, mean, variance = followed(o)
     q = task.scale(states)[:, :4]
@@ -107,6 +106,21 @@ def test_drawn_again_the_dynamics_stay_in_their_ranges():
         assert low <= f.worlds.dynamics[name].min() and f.worlds.dynamics[name].max() <= high, name
     assert (f.worlds.dynamics["mu_static"] >= f.worlds.dynamics["mu_dynamic"]).all()
     assert len(set(f.worlds.dynamics["mass"])) > f.num / 2
+
+
+def test_sensors_without_noise_are_no_division_by_zero():
+    sure = task.World(noise=(0.0025, 0.0025, 0.05, 0, 0), bias=(0.0025, 0.0025, 0.05, 0, 0))
+    states = pushed(steps=30)
+    o = ObservationModel(1, 1, 0.0, sure).trajectory(states[:, None])[:, 0]
+    assert np.isfinite(np.concatenate(followed(o, 100, world=sure)[1:])).all()
+
+
+def test_each_trajectory_has_draws_of_its_own():
+    o = torch.as_tensor(np.repeat(observed(pushed(steps=5), 0.0)[:, None], 2, 1))
+    mean = particles.Filters(50).predict(o)[0]
+    torch.manual_seed(0)
+    again = particles.Filters(50).predict(o)[0]
+    assert not mean[:, 0].equal(mean[:, 1]) and mean.equal(again)  # conftest has seeded torch with 0
 
 
 def test_too_few_particles():

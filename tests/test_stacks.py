@@ -64,7 +64,7 @@ def test_the_value_net_begins_as_pi_privs_on_the_true_state(float32):
 
 
 @pytest.mark.parametrize("entry", [("s_hat", None, "rl"), ("o", "ours", "rl"), ("s", None, "rl"), ("s_hat, sigma", "ours", "pi_priv"),
-                                   ("o", None, "pi_priv"), ("s_hat", "ours", "cloning")])
+                                   ("o", None, "pi_priv"), ("s_hat", "ours", "cloning"), ("s_hat", "typo", "rl")])
 def test_an_entry_without_a_stack_is_refused_at_once(entry):
     with pytest.raises(ValueError, match="no stack of these wrappers"):
         stacks.Method("mine", *entry)
