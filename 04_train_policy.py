@@ -96,9 +96,9 @@ def start_from(net, trained, first=0):
 
 def train_rl(run, cfg, paths, device):
     """Recurrent PPO on the method's stack (sec. 3.3). False when the time limit stopped it."""
-    method = TRAINED[cfg.method]
-    nets = [path for name, path in paths.items() if name.startswith("estimator")]
-    estimator = stacks.load_estimator(method.estimator, nets, device) if nets else None
+    method, estimator = TRAINED[cfg.method], None
+    if kind := method.estimator:
+        estimator = stacks.load_estimator(kind, stacks.find_estimator(cfg, kind), device)
     worlds, measured = training.shares(cfg)
     env = stacks.make(method, worlds, estimator, cfg.passes, privileged=cfg.privileged_critic, world=run.world)
     held_out = stacks.make(method, measured, estimator, cfg.passes, world=run.world)

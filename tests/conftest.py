@@ -1,4 +1,7 @@
+import csv
 import fcntl
+import importlib
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +11,7 @@ import torch
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
-from common import speed  # noqa: E402
+from common import command, speed  # noqa: E402
 
 speed.set_up()
 SCRIPTS = ["01_train_privileged", "02_collect", "03_train_estimator", "04_train_policy", "05_evaluate", "06_robot"]
@@ -52,3 +55,43 @@ def study(tmp_path_factory, worker_id):
                 run(out, script)
             (shared / "study.done").touch()
     return out
+
+
+@pytest.fixture
+def copy(study, tmp_path):
+    """Copies the study's stages before the n-th."""
+    def of(stages):
+        for script in SCRIPTS[:stages]:
+            shutil.copytree(study / "smoke" / script, tmp_path / "runs" / "smoke" / script)
+        return tmp_path / "runs"
+    return of
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Runs a script in this process, which spares the imports; returns stdout, stderr and the exit code."""
+    def of(out, script, *args):
+        monkeypatch.setattr(sys, "argv", [str(ROOT / f"{script}.py"), "smoke", "--out", str(out), "--device", "cpu", *args])
+        module, code = importlib.import_module(script), 0
+        try:
+            command.main(module.Config, module.PRESETS, module.main, module.__doc__)
+        except SystemExit as end:
+            code = end.code
+        return *capsys.readouterr(), code
+    return of
+
+
+def is_mistake(stdout, stderr, code, *words):
+    """One line on stderr that says `words`, and exit code 2."""
+    lines = [line for line in stderr.splitlines() if line.strip()]
+    return code == 2 and len(lines) == 1 and lines[0].startswith("error: ") and all(word in lines[0] for word in words)
+
+
+def saved(folder):
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("*.safetensors"))}
+
+
+def metrics(folder):
+    """metrics.csv without the speed."""
+    with open(folder / "metrics.csv") as file:
+        return [{key: x for key, x in row.items() if key != "steps_per_s"} for row in csv.DictReader(file)]

@@ -1,21 +1,18 @@
-"""The numbered scripts, in the smoke preset: once in order, stopped and resumed, and with what goes wrong."""
+"""The numbered scripts, in the smoke preset: once in order."""
 import csv
 import importlib
 import json
 import math
 import shutil
-import signal
-import sys
-import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import SCRIPTS, run, start
+from conftest import SCRIPTS, is_mistake, metrics
 
-from common import collection, command, files, measurements, networks, ppo, runs, stacks, statistics, task, trajectories, weights
+from common import collection, measurements, networks, statistics, task, trajectories, weights
 from common.env import PushVectorEnv
 from common.task import World
 
@@ -38,49 +35,6 @@ OUTPUTS = {
     "06_robot/seed0": ["summary.json", "robot.png", "natural_000.npz", "hand_5s_000.npz", "hand_full_000.npz"],
 } | {f"04_train_policy/{m}/seed0": ["policy.safetensors", "training.png", "success_rate.png"]
      for m in sorted(POLICIES - {"behavior_cloning"})}
-
-
-@pytest.fixture
-def copy(study, tmp_path):
-    """Copies the study's stages before the n-th."""
-    def of(stages):
-        for script in SCRIPTS[:stages]:
-            shutil.copytree(study / "smoke" / script, tmp_path / "runs" / "smoke" / script)
-        return tmp_path / "runs"
-    return of
-
-
-@pytest.fixture
-def call(monkeypatch, capsys):
-    """Runs a script in this process, which spares the imports; returns stdout, stderr and the exit code."""
-    def of(out, script, *args):
-        monkeypatch.setattr(sys, "argv", [str(ROOT / f"{script}.py"), "smoke", "--out", str(out), "--device", "cpu", *args])
-        module, code = importlib.import_module(script), 0
-        try:
-            command.main(module.Config, module.PRESETS, module.main, module.__doc__)
-        except SystemExit as end:
-            code = end.code
-        return *capsys.readouterr(), code
-    return of
-
-
-def is_mistake(stdout, stderr, code, *words):
-    """One line on stderr that says `words`, and exit code 2."""
-    lines = [line for line in stderr.splitlines() if line.strip()]
-    return code == 2 and len(lines) == 1 and lines[0].startswith("error: ") and all(word in lines[0] for word in words)
-
-
-def saved(folder):
-    return {path.name: path.read_bytes() for path in sorted(folder.glob("*.safetensors"))}
-
-
-def metrics(folder):
-    """metrics.csv without the speed."""
-    with open(folder / "metrics.csv") as file:
-        return [{key: x for key, x in row.items() if key != "steps_per_s"} for row in csv.DictReader(file)]
-
-
-# Once in order
 
 
 @pytest.mark.parametrize("folder", OUTPUTS)
@@ -301,201 +255,3 @@ def test_published_nets_are_evaluated_as_in_their_study(study, call, tmp_path, m
         shutil.rmtree(published / needed)
         words = "missing", f"(and not in --weights {published})", f"run python {needed}.py smoke", "first"
         assert is_mistake(*call(out, "05_evaluate", "--weights", str(published)), *words)
-
-
-# Stopped and resumed
-
-
-@pytest.mark.parametrize("script, method, stops", [
-    ("01_train_privileged", "", 2), ("03_train_estimator", "ours", 1), ("04_train_policy", "est", 1),
-    ("04_train_policy", "behavior_cloning", 1)])
-def test_a_stopped_run_ends_bit_for_bit_as_an_uninterrupted_one(study, copy, script, method, stops):
-    out, which = copy(SCRIPTS.index(script)), ["--method", method] if method else []
-    for _ in range(stops):
-        assert "stopped after" in run(out, script, *which, "--max-minutes", "0")
-    assert "stopped after" not in run(out, script, *which, "--max-minutes", "0")
-    here, there = (root / "smoke" / script / method / "seed0" for root in (out, study))
-    assert saved(here) == saved(there)
-    assert metrics(here) == metrics(there)
-
-
-def test_a_stopped_collection_goes_on_where_it_was(study, copy, call):
-    out, states = copy(1), "smoke/02_collect/seed0/train_states.npy"
-    for _ in range(20):
-        stdout, _, code = call(out, "02_collect", "--max-minutes", "0")
-        assert code == 0
-        if "stopped after" not in stdout:
-            break
-    assert (out / states).read_bytes() == (study / states).read_bytes()
-
-
-def test_a_killed_run_ends_bit_for_bit_as_an_uninterrupted_one(study, tmp_path):
-    script = "01_train_privileged"
-    here, there = (root / "smoke" / script / "seed0" for root in (tmp_path / "runs", study))
-    process = start(tmp_path / "runs", script)
-    while not (here / "resume.pt").exists() and process.poll() is None:
-        time.sleep(0.005)
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL and not (here / "policy.safetensors").exists()
-    run(tmp_path / "runs", script)
-    assert saved(here) == saved(there) and metrics(here) == metrics(there)
-
-
-# What goes wrong
-
-
-@pytest.mark.parametrize("script, needed", [("02_collect", "01_train_privileged"), ("03_train_estimator", "02_collect"),
-                                            ("04_train_policy", "01_train_privileged"), ("05_evaluate", "01_train_privileged"),
-                                            ("06_robot", "03_train_estimator")])
-def test_a_missing_stage_is_named(tmp_path, call, script, needed):
-    assert is_mistake(*call(tmp_path / "runs", script), f"run python {needed}.py smoke", "first")
-
-
-def test_the_test_set_is_demanded(copy, call):
-    assert is_mistake(*call(copy(1), "05_evaluate"), "test_states.npy is missing", "run python 02_collect.py smoke", "first")
-
-
-def test_a_missing_estimator_is_named(copy, call):
-    out = copy(2)
-    result = call(out, "04_train_policy", "--method", "est_mse")
-    assert is_mistake(*result, "run python 03_train_estimator.py smoke --method mse", "first")
-
-
-@pytest.mark.parametrize("damage", ["deleted", "cut", "changed"])
-@pytest.mark.parametrize("script, file, needed", [
-    ("02_collect", "01_train_privileged/seed0/checkpoint_001.safetensors", "python 01_train_privileged.py smoke"),
-    ("03_train_estimator", "02_collect/seed0/train_states.npy", "python 02_collect.py smoke"),
-    ("04_train_policy", "03_train_estimator/ours/seed0/estimator.safetensors",
-     "python 03_train_estimator.py smoke --method ours"),
-    ("05_evaluate", "04_train_policy/est/seed0/policy.safetensors", "python 04_train_policy.py smoke --method est")])
-def test_a_damaged_input_names_its_stage(copy, call, script, file, needed, damage):
-    out = copy(SCRIPTS.index(script))
-    path = out / "smoke" / file
-    whole = path.read_bytes()
-    match damage:
-        case "deleted":
-            path.unlink()
-        case "cut":
-            path.write_bytes(whole[:-100])
-        case "changed":
-            path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-    assert is_mistake(*call(out, script), "missing or damaged", f"run {needed}", "--force")
-
-
-@pytest.mark.parametrize("script, method, args, words", [
-    ("01_train_privileged", "", ("--lr", "1e30", "--lr-max", "1e30"), "diverged in update"),
-    ("03_train_estimator", "mse", ("--lr", "1e30", "--lr-end", "1e30"), "diverged in epoch")])
-def test_a_training_that_diverged_does_not_finish(copy, call, script, method, args, words):
-    out = copy(SCRIPTS.index(script))
-    stdout, stderr, code = call(out, script, "--seed", "1", *(("--method", method) if method else ()), *args)
-    assert code == 2 and words in stderr and "Traceback" not in stderr
-    assert not json.loads((out / "smoke" / script / method / "seed1" / "config.json").read_text())["finished"]
-
-
-@pytest.mark.parametrize("script, args, words", [
-    ("01_train_privileged", ("--device", "cuda"), "no GPU"), ("02_collect", ("--device", "cuda"), "no GPU"),
-    ("02_collect", ("--seed", "1"), "seed 0's trajectories"),
-    ("03_train_estimator", ("--dropout", "1"), "below 1"), ("04_train_policy", ("--sizes", "8", "8", "8"), "--no-warm-start")])
-def test_a_mistake_costs_no_run(study, call, script, args, words, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert is_mistake(*call(study, script, "--force", *args), words)
-    assert all((study / "smoke" / folder / name).exists() for folder, names in OUTPUTS.items() for name in names)
-
-
-def test_a_stale_input_names_the_stage_to_redo(copy, call):
-    out = copy(3)
-    assert call(out, "01_train_privileged", "--force", "--lr", "2e-3")[2] == 0
-    assert is_mistake(*call(out, "02_collect"), "inputs changed", "checkpoint_002.safetensors", "--force")
-    assert is_mistake(*call(out, "03_train_estimator"), "stale", "run python 02_collect.py smoke", "--force")
-    assert is_mistake(*call(out, "04_train_policy"), "stale", "--force")
-
-
-def test_what_reads_no_net_is_trained_in_the_world_of_01_all_the_same(copy, call):
-    out = copy(0)
-    assert call(out, "01_train_privileged", "--starts", "centre", "--mass", "1", "2")[2] == 0
-    assert call(out, "04_train_policy", "--method", "end_to_end", "--no-warm-start")[2] == 0
-    world = json.loads((out / "smoke/04_train_policy/end_to_end/seed0/config.json").read_text())["world"]
-    assert (world["starts"], world["mass"], world["box"]) == ("centre", [1.0, 2.0], [0.12, 0.10, 0.07])
-
-
-def test_a_box_that_the_robot_is_not_made_for_is_one_line(copy, call):
-    out = copy(4)
-    for path in (out / "smoke").glob("0[34]*/**/config.json"):
-        record = json.loads(path.read_text())
-        record["world"]["box"] = [0.14, 0.10, 0.07]
-        files.save_json(path, record)
-    assert is_mistake(*call(out, "06_robot"), "--box (0.14, 0.1, 0.07)", "made for (0.12, 0.1, 0.07) only")
-    assert not (out / "smoke" / "06_robot").exists()
-
-
-def test_too_few_particles_are_one_line(study, call):
-    assert is_mistake(*call(study, "05_evaluate", "--particles", "9"), "--particles 9", "say 10 or more")
-
-
-@pytest.mark.parametrize("script", SCRIPTS)
-def test_every_preset_is_a_config(script):
-    module = importlib.import_module(script)
-    for preset in module.PRESETS:
-        assert command.parse(module.Config, module.PRESETS, module.__doc__, [preset]).preset == preset
-
-
-def test_mistakes_on_the_command_line_are_one_line(tmp_path):
-    for field, value, words in (("--lerning-rate", "1", "--help"), ("--updates", "many", "--updates"),
-                                ("--checkpoints", "1", "say 2 to 7"), ("--mass", "2 1", "the least first"),
-                                ("--box", "0.3 0.2 0.07", "no room to start"), ("--starts", "here", "--starts")):
-        process = start(tmp_path / "runs", "01_train_privileged", field, *value.split())
-        assert is_mistake(*process.communicate(), process.returncode, field, words)
-    assert not (tmp_path / "runs").exists()
-
-
-# The paper's nets
-
-
-def paper(script, **kw):
-    """A script as a module, and its paper's config with less to do."""
-    module = importlib.import_module(script)
-    return module, module.Config(device="cpu", epochs=1, **kw)
-
-
-@pytest.fixture
-def few(monkeypatch):
-    """Five trajectories instead of any set."""
-    states = np.random.default_rng(0).uniform(-0.1, 0.1, (100, 7)).astype(np.float32)
-    data = states, np.array([0, 30, 40, 50, 90, 100])
-    monkeypatch.setattr(trajectories, "load_set", lambda cfg, name: (data, {}))
-    return data
-
-
-def test_ppo_updates_the_papers_nets_with_the_papers_estimator():
-    module, cfg = paper("04_train_policy", num_envs=8)
-    env = stacks.make(stacks.METHODS["est_uncertainty"], cfg.num_envs, networks.Estimator().requires_grad_(False), cfg.passes)
-    actor, critic = networks.policy(12, cfg.sizes), networks.value(12, cfg.sizes)
-    optimizers = [torch.optim.Adam(net.parameters(), lr=cfg.lr) for net in (actor, critic)]
-    carry, before = (env.reset(seed=0)[0], actor.initial(8), critic.initial(8)), actor.encoder.weight.clone()
-    batch, _ = ppo.rollout(env, actor, critic, carry, 10)
-    stats = ppo.update(actor, critic, optimizers, ppo.sequences(batch, critic, cfg.gamma, cfg.lam), cfg)
-    assert batch["obs"].shape == (10, 8, 12) and np.isfinite(list(stats.values())).all()
-    assert not actor.encoder.weight.equal(before)
-
-
-def test_the_papers_estimator_takes_an_update(tmp_path, few):
-    module, cfg = paper("03_train_estimator", method="ours", out=tmp_path)
-    run = runs.Run(cfg, "03_train_estimator", {}, "ours")
-    assert module.train(run, cfg, few, few, torch.device("cpu"))
-    f = weights.load(networks.Estimator, run.dir / "estimator.safetensors")
-    torch.manual_seed(0)
-    assert f.sizes == (1024, 512, 256) and not f.lstm.weight_hh_l0.equal(networks.Estimator().lstm.weight_hh_l0)
-
-
-def test_the_papers_student_takes_an_update_toward_its_teacher(tmp_path, few):
-    module, cfg = paper("04_train_policy", method="behavior_cloning", bc_epochs=8, out=tmp_path)
-    weights.save(path := tmp_path / "teacher.safetensors", teacher := networks.policy(8))
-    with torch.no_grad():
-        teacher.head[-1].bias[3] = teacher.head[-1].bias[11 + 7] = 3.0
-    weights.save(path, teacher)
-    run = runs.Run(cfg, "04_train_policy", {}, "behavior_cloning")
-    student = module.train_bc(run, cfg, {"policy": path}, torch.device("cpu"))
-    losses = [row["validation_loss"] for row in run.rows()]
-    assert tuple(student.sizes) == (128, 256, 128) and losses[-1] < losses[0] - 0.5
-    assert (networks.mode(student(torch.zeros(1, 1, 9))[0]) == torch.tensor([3, 7])).all()
