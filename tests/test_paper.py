@@ -51,7 +51,8 @@ def test_the_papers_student_takes_an_update_toward_its_teacher(tmp_path, few):
         teacher.head[-1].bias[3] = teacher.head[-1].bias[11 + 7] = 3.0
     weights.save(path, teacher)
     run = runs.Run(cfg, "04_train_policy", {}, "behavior_cloning")
-    student = module.train_bc(run, cfg, {"policy": path}, torch.device("cpu"))
+    assert module.train_bc(run, cfg, {"policy": path}, torch.device("cpu"))
+    student = weights.load(networks.Recurrent, run.dir / "policy.safetensors")
     losses = [row["validation_loss"] for row in run.rows()]
     assert tuple(student.sizes) == (128, 256, 128) and losses[-1] < losses[0] - 0.5
     assert (networks.mode(student(torch.zeros(1, 1, 9))[0]) == torch.tensor([3, 7])).all()
