@@ -42,19 +42,28 @@ class Cloned:
 @dataclass
 class Config(Cloned, Reinforced, command.Reader):
     method: Literal[(*TRAINED, "all")] = "all"  # which policy to train
+    sizes: tuple[int, int, int] | None = (128, 256, 128)  # linear, LSTM and linear layer (appendix B.1); none: pi_priv's
 
 
 _QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy_coef=0.0005, kl_target=0.015,
-              kl_target_end=0.003, lr=3e-4, lr_min=2e-5, lr_max=2e-3, warm_start=True, privileged_critic=True,
+              kl_target_end=0.003, lr=3e-4, lr_min=2e-5, lr_max=2e-3, sizes=None, warm_start=True, privileged_critic=True,
               bc_lr=2e-3, bc_lr_end=5e-5)
 PRESETS = {
-    "smoke": dict(num_envs=32, rollout_steps=16, updates=4, minibatch=256, epochs=2, sizes=(16, 16, 16), eval_every=4,
+    "smoke": dict(num_envs=32, rollout_steps=16, updates=4, minibatch=256, epochs=2, sizes=None, eval_every=4,
                   eval_episodes=16, resume_every=2, warm_start=True, privileged_critic=True, passes=2, bc_sequences=16,
                   bc_epochs=2, bc_validation=12),
-    "quick": _QUICK | dict(updates=80, sizes=(64, 128, 64), passes=5, bc_sequences=25, bc_epochs=2, bc_validation=500),
+    "quick": _QUICK | dict(updates=80, passes=5, bc_sequences=25, bc_epochs=2, bc_validation=500),
     "laptop": _QUICK | dict(updates=500, passes=10, bc_sequences=32, bc_epochs=6, bc_validation=1000),
     "paper": {},
 }
+
+
+def with_sizes(cfg):
+    """The config, where it leaves the sizes to pi_priv with those."""
+    if cfg.sizes:
+        return cfg
+    pi_priv = runs.find(cfg, "01_train_privileged", "policy.safetensors")
+    return replace(cfg, sizes=weights.load(networks.Recurrent, pi_priv).sizes)
 
 
 def settings_of(cfg):
@@ -142,7 +151,7 @@ def train_bc(run, cfg, paths, device):
 def main(cfg):
     device = command.device_of(cfg)
     for method in [name for name, m in TRAINED.items() if m.published] if cfg.method == "all" else [cfg.method]:
-        cfg, cloning = replace(cfg, method=method), TRAINED[method].training == "cloning"
+        cfg, cloning = with_sizes(replace(cfg, method=method)), TRAINED[method].training == "cloning"
         paths = inputs_of(cfg)
         run = runs.Run(cfg, "04_train_policy", paths, method, settings_of(cfg))
         if run.skip():
