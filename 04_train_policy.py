@@ -59,11 +59,14 @@ PRESETS = {
 
 
 def with_sizes(cfg):
-    """The config, where it leaves the sizes to pi_priv with those."""
-    if cfg.sizes:
+    """The config, where it leaves the sizes to pi_priv with those. Raises UserError: it starts from a pi_priv of others."""
+    starts = cfg.warm_start and TRAINED[cfg.method].training == "rl"
+    if cfg.sizes and not starts:
         return cfg
-    pi_priv = runs.find(cfg, "01_train_privileged", "policy.safetensors")
-    return replace(cfg, sizes=weights.load(networks.Recurrent, pi_priv).sizes)
+    sizes = weights.load(networks.Recurrent, runs.find(cfg, "01_train_privileged", "policy.safetensors")).sizes
+    if cfg.sizes not in (None, sizes):
+        raise UserError(f"--sizes {cfg.sizes}: pi_priv has {sizes}; use those, or --no-warm-start")
+    return replace(cfg, sizes=sizes)
 
 
 def settings_of(cfg):
@@ -86,12 +89,10 @@ def inputs_of(cfg):
         train, validation = (trajectories.load_set(cfg, f"teacher_{name}")[1] for name in ("train", "validation"))
         return nets("policy") | train | validation
     paths = nets("policy", "value") if cfg.warm_start else {}
-    if cfg.warm_start and (sizes := weights.load(networks.Recurrent, paths["policy"]).sizes) != cfg.sizes:
-        raise UserError(f"--sizes {cfg.sizes}: pi_priv has {sizes}; use those, or --no-warm-start")
     if kind := TRAINED[cfg.method].estimator:
-        nets_of = stacks.find_estimator(cfg, kind)
-        stacks.load_estimator(kind, nets_of)
-        paths |= {f"estimator{i or ''}": path for i, path in enumerate(nets_of)}
+        found = stacks.find_estimator(cfg, kind)
+        stacks.load_estimator(kind, found)  # what does not fit is told before a run is begun
+        paths |= {f"estimator{i or ''}": path for i, path in enumerate(found)}
     return paths or nets("policy")  # what reads no net has pi_priv's world all the same
 
 

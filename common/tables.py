@@ -76,8 +76,9 @@ def calibrated(results):
         for key in calibration.TALLIES:
             if told := e.get(key):
                 shares = [", ".join(f"{100 * x:.0f}" for x in told[f"within_{k}_sigma"]) for k in (1, 2)]
-                nees = [told["nees"]["mean"][age:age + 1] for age in (0, 3, 10)]
-                scores = [", ".join(f"{x:.2f}" for x in values) for values in (told["nll"], told["crps"], sum(nees, []))]
+                mean = told["nees"]["mean"]
+                nees = [mean[age] for age in (0, 3, 10) if age < len(mean)]
+                scores = [", ".join(f"{x:.2f}" for x in values) for values in (told["nll"], told["crps"], nees)]
                 rows.append([f"{name}{', scaled' * (key == 'scaled')}", *shares, *scores])
     title = "Calibration of x, y (mm) and theta (degrees), of estimators on the test set and in the loops of policies"
     return titled(title, ["sigma of", "1 (68 %)", "2 (95 %)", "NLL", "CRPS", "NEES / 3: seen, 3 s, 10 s after"], rows)

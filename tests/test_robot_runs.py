@@ -33,18 +33,12 @@ def nets(tmp_path_factory):
 
 
 @pytest.fixture
-def robot(nets, monkeypatch, capsys):
+def robot(nets, call):
     """Runs 06 in this process; returns stdout, stderr, the exit code and the run's folder."""
     def of(*args, seed=None):
         done = nets / "smoke" / "06_robot"
         seed = str(1000 + len([*done.glob("*")]) if seed is None else seed)  # unused, and the same whatever other files ran before
-        monkeypatch.setattr(sys, "argv", ["06_robot.py", "smoke", "--out", str(nets), "--seed", seed, *args])
-        module, code = importlib.import_module("06_robot"), 0
-        try:
-            command.main(module.Config, module.PRESETS, module.main, module.__doc__)
-        except SystemExit as end:
-            code = end.code
-        return *capsys.readouterr(), code, done / f"seed{seed}"
+        return *call(nets, "06_robot", "--seed", seed, *args), done / f"seed{seed}"
     return of
 
 

@@ -94,12 +94,13 @@ class Page(ThreadingHTTPServer):
     def __exit__(self, *error):
         self.drawing = False
         self.fresh.set()
+        self.painter.kill()  # whatever it does: the thread that waits for it ends too
+        self.painter.wait()
         self.shutdown()
         self.server_close()
         for thread in self.threads:
             thread.join(5)
         self.pipe.close()
-        self.painter.wait(5)
 
     def begin(self, title):
         """A run begins."""
