@@ -19,7 +19,9 @@ from common.weights import save_tensors
 ROOT = Path(__file__).parent.parent
 BEFORE = World("inner", support=C_060, support_offset=(0.0, 0.0))
 WORLD = ["--starts", "inner", "--support", *map(repr, C_060), "--support-offset", "0", "0"]
-RECIPE = ["--sizes", "128", "256", "128", "--updates", "1000", "--kl-target-end", "None", "--lr-min", "1e-4"]
+RECIPE = {"01_train_privileged": [*WORLD, "--sizes", "128", "256", "128", "--updates", "1000", "--kl-target-end", "None",
+                                  "--lr-min", "1e-4"],
+          "03_train_estimator": ["--sizes", "256", "256", "256", "--epochs", "20"]}
 RECORDS = [path.parent.relative_to(ROOT / "pretrained") for path in sorted((ROOT / "pretrained").rglob("config.json"))]
 PUBLISHED = [folder for folder in RECORDS if folder.parts[0] != "next"]  # in the world, and by the recipe, of before
 
@@ -94,8 +96,8 @@ def test_every_published_run_has_the_settings_of_its_preset(folder, tmp_path):
     stage, *method, seed = folder.parts
     module = importlib.import_module(stage)
     options = ["--method", *method] * bool(method) + ["--seed", seed[4:], "--out", str(tmp_path)]
-    if stage.startswith("01") and root.name != "next":
-        options += WORLD + RECIPE
+    if root.name != "next":
+        options += RECIPE.get(stage, [])
     cfg, reads = command.parse(module.Config, module.PRESETS, "", ["laptop", *options]), None
     if stage.startswith("04"):
         cfg = module.with_sizes(cfg)
