@@ -1,6 +1,4 @@
 """The observation model O of sec. 3.2: o = scale(clip(hold(s + bias + noise))) and the occlusion flag xi."""
-from collections import deque
-
 import numpy as np
 
 from common import task
@@ -22,7 +20,7 @@ class ObservationModel:
         self.num, self.occlusion, self.world = num, occlusion, world
         self.deviation = np.array(world.noise, np.float32)
         self.bias, self.held = np.zeros((num, 5), np.float32), np.zeros((num, 3), np.float32)  # SI units
-        self.frames = deque(np.zeros((world.late, num, 3)))  # the boxes that the camera has not shown yet
+        self.frames = np.zeros((world.late, num, 3), np.float32)  # the boxes that the camera has not shown yet
         self.hidden = np.zeros(num)  # frames for which the running occlusion still hides the box
         self.seed(seed)
 
@@ -31,48 +29,63 @@ class ObservationModel:
 
     def reset(self, worlds, state):
         """First observations (k, 9) of new episodes in `worlds` (k,) from states (k, 7): never occluded."""
-        for frame in self.frames:  # the box was at rest before
-            frame[worlds] = state[:, :3]
-        noise, frames = self._draw(self._rng_reset, len(worlds))
+        self.frames[:, worlds] = state[:, :3]  # the box was at rest before
+        noise, (self.hidden[worlds],) = self._draw(self._rng_reset, 1, len(worlds))
         self.bias[worlds] = self._rng_reset.standard_normal((len(worlds), 5), np.float32) * self.world.bias
-        noisy = self._add(state, self.bias[worlds] + noise)
-        self.held[worlds], self.hidden[worlds] = noisy[:, :3], frames
+        noisy = self._add(state, self.bias[worlds] + noise[0])
+        self.held[worlds] = noisy[:, :3]
         return assemble(noisy, np.zeros(len(worlds), bool), self.world.max_force)
 
     def step(self, state):
         """Observations (N, 9) of states (N, 7), float32: the scaled state (8) with the box held in an occlusion, and xi."""
-        noise, frames = self._draw(self._rng_step, self.num)
+        return self.steps(state[None])[0]
+
+    def steps(self, states):
+        """`step` for states (T, N, 7), one behind the other: observations (T, N, 9)."""
+        noise, frames = self._draw(self._rng_step, len(states), self.num)
+        occluded = np.empty(frames.shape, bool)
+        for t, more in enumerate(frames):
+            occluded[t] = self.hidden > 0
+            self.hidden = np.where(occluded[t], self.hidden - 1, more)
         if self.world.late:
-            self.frames.append(state[:, :3].copy())
-            state = np.concatenate([self.frames.popleft(), state[:, 3:]], 1)
-        occluded = self.hidden > 0
-        noisy = self._add(state, self.bias + noise)
-        self.held = noisy[:, :3] = np.where(occluded[:, None], self.held, noisy[:, :3])
-        self.hidden = np.where(occluded, self.hidden - 1, frames)
+            boxes = np.concatenate([self.frames, states[..., :3]])
+            states, self.frames = np.concatenate([boxes[:len(states)], states[..., 3:]], -1), boxes[len(states):]
+        noisy = self._add(states, self.bias + noise)
+        last = np.zeros((len(states) + 1, self.num), int)  # the row of the last sight, as `held` is row 0
+        np.maximum.accumulate(np.where(occluded, 0, np.arange(1, len(last))[:, None]), out=last[1:])
+        shown = np.concatenate([self.held[None], noisy[..., :3]])[last, np.arange(self.num)]
+        noisy[..., :3], self.held = shown[1:], shown[-1]
         return assemble(noisy, occluded, self.world.max_force)
 
     def trajectory(self, states):
         """Observations (T, N, 9) of stored trajectories (T, N, 7), each from its episode's start."""
-        return np.stack([self.reset(np.arange(self.num), states[0]), *(self.step(s) for s in states[1:])])
+        return np.concatenate([self.reset(np.arange(self.num), states[0])[None], self.steps(states[1:])])
 
-    def _draw(self, rng, count):
-        """Noise (count, 5), and how many frames to hide after a visible one: round(15 d) with probability p, else 0."""
-        noise = rng.standard_normal((count, 5), np.float32) * self.deviation
-        start, seconds = rng.random(count), rng.normal(*self.world.occlusion, count)
+    def _draw(self, rng, steps, count):
+        """Noise (steps, count, 5), and how many frames to hide after a visible one: round(15 d) with probability p, else 0.
+
+        Step by step, so that the draws of one are the same however many are drawn at once.
+        """
+        noise, (start, seconds) = np.empty((steps, count, 5), np.float32), np.empty((2, steps, count))
+        for t in range(steps):
+            rng.standard_normal(out=noise[t], dtype=np.float32)
+            rng.random(out=start[t])
+            seconds[t] = rng.normal(*self.world.occlusion, count)
         seconds = seconds if self.occlusion is None else self.occlusion
-        return noise, np.where(start < self.world.occlusion_start, np.maximum(np.round(task.RATE * seconds), 0), 0)
+        hides = np.where(start < self.world.occlusion_start, np.maximum(np.round(task.RATE * seconds), 0), 0)
+        return noise * self.deviation, hides
 
-    def _add(self, state, error):
-        noisy = state.astype(np.float32)
+    def _add(self, states, error):
+        noisy = states.astype(np.float32)
         if self.world.gain != 1:
-            noisy[:, 5:] *= self.world.gain
-        noisy[:, [0, 1, 2, 5, 6]] += error
+            noisy[..., 5:] *= self.world.gain
+        noisy[..., [0, 1, 2, 5, 6]] += error
         return noisy
 
 
 def assemble(noisy, occluded, max_force=World.max_force):
-    """Observations o (N, 9) of noisy states (N, 7) and occlusion flags (N,): scaled (8), and xi."""
-    return np.concatenate([task.scale(noisy, max_force), occluded[:, None].astype(np.float32)], 1)
+    """Observations o (..., 9) of noisy states (..., 7) and occlusion flags (...): scaled (8), and xi."""
+    return np.concatenate([task.scale(noisy, max_force), occluded[..., None].astype(np.float32)], -1)
 
 
 class Observed(EpisodeWrapper):
