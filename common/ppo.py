@@ -45,41 +45,44 @@ def rollout(env, actor, critic, carry, steps):
 
     Args:
         carry: observations (N, D) and the hidden states of actor and critic, each its (h, c).
-    Returns: batch: obs (T, N, D), actions (T, N, 2), logp (T, N, 2, 11), reward, terminated, done (T, N), final (T, N, D; set
-    where done, and the next observation in the last row), success (episodes, successes), hidden_pi and hidden_v
-    at the start; and the next carry.
+    Returns: batch: obs (T, N, D), actions (T, N, 2), logp (T, N, 2, 11), reward, terminated, done, value V(s_t) and next_value
+    V(s_{t+1}) (T, N; any where terminated), success (episodes, successes), hidden_pi and hidden_v at the start; and the next
+    carry.
     """
     device = next(actor.parameters()).device
     obs, hidden_pi, hidden_v = carry
     start = {"hidden_pi": hidden_pi, "hidden_v": hidden_v}
-    b = {name: np.zeros((steps, *obs.shape), np.float32) for name in ("obs", "final")}
-    b |= {"reward": np.zeros((steps, len(obs)), np.float32)}
+    b = {"obs": np.zeros((steps, *obs.shape), np.float32), "reward": np.zeros((steps, len(obs)), np.float32)}
     b |= {name: np.zeros((steps, len(obs)), bool) for name in ("terminated", "done")}
-    actions, logps, successes = [], [], 0
+    actions, logps, value, cut, successes = [], [], [], [], 0
 
-    def see(net, x, hidden):
+    def see(net, obs, hidden):
         with torch.no_grad(), speed.autocast(device):
-            return net(x, hidden)
+            return net(torch.as_tensor(obs, device=device)[None, :, :net.inputs], hidden)
 
     for t in range(steps):
         b["obs"][t] = obs
-        x = torch.as_tensor(obs, device=device)[None]
-        remembering = speed.pool.submit(see, critic, x, hidden_v)  # while the policy acts and the worlds move
-        logits, hidden_pi = see(actor, x[..., :actor.inputs], hidden_pi)
+        judging = speed.pool.submit(see, critic, obs, hidden_v)  # while the policy acts and the worlds move
+        logits, hidden_pi = see(actor, obs, hidden_pi)
         action = sample(logits[0])
         actions.append(action)
         logps.append(log_softmax(logits[0]))
         obs, b["reward"][t], b["terminated"][t], truncated, infos = env.step(action.cpu().numpy())
         b["done"][t] = b["terminated"][t] | truncated
-        hidden_v = remembering.result()[1]
+        v, hidden_v = judging.result()
+        value.append(v[0, :, 0])
         if "final_obs" in infos:
-            b["final"][t] = infos["final_obs"]
+            late = np.flatnonzero(truncated & ~b["terminated"][t])
+            if late.size:
+                cut.append((t, late, see(critic, infos["final_obs"][late], tuple(h[:, late] for h in hidden_v))[0][0, :, 0]))
             ended = torch.as_tensor(b["done"][t], device=device)
             hidden_pi, hidden_v = forget(hidden_pi, ended), forget(hidden_v, ended)
             successes += int((infos["success"] & b["done"][t]).sum())
-    b["final"][-1] = np.where(b["done"][-1][:, None], b["final"][-1], obs)
     batch = {k: torch.as_tensor(v, device=device) for k, v in b.items()}
-    batch |= start | {"actions": torch.stack(actions), "logp": torch.stack(logps)}
+    batch |= start | {"actions": torch.stack(actions), "logp": torch.stack(logps), "value": torch.stack(value)}
+    batch["next_value"] = torch.cat([batch["value"][1:], see(critic, obs, hidden_v)[0][..., 0]])
+    for t, worlds, v in cut:  # the time limit: the episode would have gone on
+        batch["next_value"][t, worlds] = v
     batch["success"] = (int(b["done"].sum()), successes)
     return batch, (obs, hidden_pi, hidden_v)
 
@@ -103,10 +106,9 @@ def split(done):
     return position.view(n, steps).T, sequence.view(n, steps).T, first // steps, first % steps
 
 
-def pad(x, position, sequence, length=None):
+def pad(x, position, sequence):
     """Steps (T, N, ...) as padded sequences (L, S, ...); the last of them, at least one, are empty."""
-    length = length or int(position.max()) + 1
-    out = x.new_zeros(length, ((int(sequence.max()) + 1) // speed.WIDTH + 1) * speed.WIDTH, *x.shape[2:])
+    out = x.new_zeros(int(position.max()) + 1, ((int(sequence.max()) + 1) // speed.WIDTH + 1) * speed.WIDTH, *x.shape[2:])
     out[position, sequence] = x
     return out
 
@@ -131,38 +133,23 @@ def moments(x):
     return total / count, math.sqrt(squares / (count - 1))
 
 
-def values(critic, obs, hidden, position, sequence):
-    """V(s_t) and V(s_{t+1}), each (T, N), from one fused pass over padded sequences (L + 1, S, D).
-
-    What follows a step stands in the next row of its sequence; behind the last step that is the row which `sequences` adds.
-    """
-    with torch.no_grad(), speed.autocast(obs.device):
-        v = critic(obs, hidden)[0].squeeze(-1)
-    return v[position, sequence], v[position + 1, sequence]
-
-
-def sequences(batch, critic, gamma, lam):
+def sequences(batch, gamma, lam):
     """A rollout as padded sequences (L, S, ...), with advantages, returns and the hidden states at their starts."""
+    advantage = gae(*(batch[name] for name in ("reward", "value", "next_value", "terminated", "done")), gamma, lam)
+    returns = advantage + batch["value"]
+    mean, std = moments(advantage)
+    explained = 1 - (std / (moments(returns)[1] + 1e-8))**2
+    advantage = (advantage - mean) / (std + 1e-8)
     position, sequence, world, start = split(batch["done"])
-    last = batch["done"].clone()
-    last[-1] = True
-    obs = pad(batch["obs"], position, sequence, int(position.max()) + 2)
-    obs[position[last] + 1, sequence[last]] = batch["final"][last]
+    seq = {name: pad(x, position, sequence) for name, x in {
+        "obs": batch["obs"], "actions": batch["actions"], "logp": batch["logp"], "advantage": advantage, "returns": returns,
+        "mask": torch.ones_like(advantage)}.items()}
 
     def at_start(hidden):
-        return tuple(F.pad(h[:, world] * (start == 0)[None, :, None], (0, 0, 0, obs.shape[1] - len(world))) for h in hidden)
+        return tuple(F.pad(h[:, world] * (start == 0)[None, :, None], (0, 0, 0, seq["mask"].shape[1] - len(world)))
+                     for h in hidden)
 
-    hidden_pi, hidden_v = at_start(batch["hidden_pi"]), at_start(batch["hidden_v"])
-    value, next_value = values(critic, obs, hidden_v, position, sequence)
-    advantage = gae(batch["reward"], value, next_value, batch["terminated"], batch["done"], gamma, lam)
-    returns = advantage + value
-    explained = 1 - (moments(returns - value)[1] / moments(returns)[1])**2
-    mean, std = moments(advantage)
-    advantage = (advantage - mean) / (std + 1e-8)
-    steps = {"actions": batch["actions"], "logp": batch["logp"], "advantage": advantage, "returns": returns,
-             "mask": torch.ones_like(advantage)}
-    return {"obs": obs[:-1], "hidden_pi": hidden_pi, "hidden_v": hidden_v, "explained": explained} | {
-        name: pad(x, position, sequence) for name, x in steps.items()}
+    return seq | {name: at_start(batch[name]) for name in ("hidden_pi", "hidden_v")} | {"explained": explained}
 
 
 def _columns(seq, cols, *names):
@@ -236,12 +223,12 @@ def update(actor, critic, optimizers, seq, hp):
     """
     count = int(seq["mask"][0].sum())
     counts, steps = zip(*ranks.gather((count, seq["mask"].sum().item())))
-    per_epoch = min(*counts, max(1, round(sum(steps) / hp.minibatch)))
+    per_epoch = min(max(1, round(sum(steps) / hp.minibatch)), *(math.ceil(n / speed.WIDTH) for n in counts))
 
     def deal():
-        """All sequences in random order to mini-batches of one width, filled up with the empty one after the last."""
-        order = F.pad(torch.randperm(count), (0, -count % (speed.WIDTH * per_epoch)), value=count)
-        return order.to(seq["mask"].device).view(-1, per_epoch).T
+        """All sequences in random order, in mini-batches of whole blocks, filled up with the empty one after the last."""
+        order = F.pad(torch.randperm(count), (0, -count % speed.WIDTH), value=count).to(seq["mask"].device)
+        return [blocks.flatten() for blocks in order.view(-1, speed.WIDTH).tensor_split(per_epoch)]
 
     batches = [cols for _ in range(hp.epochs) for cols in deal()]
     both = map if seq["mask"].is_cuda and ranks.COUNT > 1 else speed.side_by_side  # nccl knows one order of collectives

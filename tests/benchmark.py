@@ -81,7 +81,7 @@ def learn(what, preset, most, **changes):
     batch, _ = ppo.rollout(env, actor, critic, carry, hp.rollout_steps)
 
     def update():
-        ppo.update(actor, critic, optimizers, ppo.sequences(batch, critic, hp.gamma, hp.lam), hp)
+        ppo.update(actor, critic, optimizers, ppo.sequences(batch, hp.gamma, hp.lam), hp)
 
     def both():
         ppo.rollout(env, actor, critic, carry, hp.rollout_steps)

@@ -40,11 +40,12 @@ def ends(process, code=0):
 def rollout_of_both():
     """A rollout of HP.num_envs worlds, random but for its form, the same on every rank."""
     rng, shape = np.random.default_rng(0), (HP.rollout_steps, HP.num_envs)
-    batch = {"obs": rng.normal(size=(*shape, 8)), "final": rng.normal(size=(*shape, 8)), "reward": rng.normal(size=shape)}
+    batch = {"obs": rng.normal(size=(*shape, 8)), "reward": rng.normal(size=shape)}
     batch |= {"logp": networks.log_softmax(torch.tensor(rng.normal(size=(*shape, 22))))}
     batch = {name: torch.as_tensor(x).float() for name, x in batch.items()}
     done = torch.tensor(rng.random(shape) < 0.1)
-    return batch | {"done": done, "terminated": done, "actions": torch.tensor(rng.integers(0, 11, (*shape, 2)))}
+    return batch | {"done": done, "terminated": done, "actions": torch.tensor(rng.integers(0, 11, (*shape, 2)))} | {
+        name: torch.tensor(rng.normal(size=shape)).float() for name in ("value", "next_value")}
 
 
 def nets():
@@ -57,7 +58,7 @@ def one_update(worlds):
     batch = {name: x[:, worlds] for name, x in rollout_of_both().items()}
     pair = actor, critic = nets()
     batch |= {name: net.initial(len(worlds)) for name, net in zip(("hidden_pi", "hidden_v"), pair)}
-    seq = ppo.sequences(batch, critic, HP.gamma, HP.lam)
+    seq = ppo.sequences(batch, HP.gamma, HP.lam)
     stats = ppo.update(actor, critic, [torch.optim.SGD(net.parameters(), lr=1.0) for net in pair], seq, HP)
     return {"stats": stats, "nets": [net.state_dict() for net in pair]}
 
