@@ -41,7 +41,7 @@ class Config(hardware.Gaps, command.Reader):
     realtime: bool = False  # let the simulated arm move in real time and in a thread of its own, as a real one does
     think: float = command.setting(0.03, before=0.0)  # s that the simulated clock runs on while the program thinks; below 1/15
     arm: str = "simulated"  # module:Class of a real one, with the methods of hardware.Arm; it is given this config
-    camera: str = ""  # device number, file or address of a camera that OpenCV opens, instead of the arm's own
+    camera: str = ""  # device number or address of a camera that OpenCV opens, instead of a real arm's own
     view: tuple[int, ...] | None = None  # show the runs at http://127.0.0.1:8006, or another port; to join in, with --realtime
     print_tags: bool = False  # write the sheet of tags for the box, and nothing else
     free: ClassVar = (*command.Reader.free, "scenario", "runs", "video", "realtime", "view", "print_tags")
@@ -58,24 +58,28 @@ PRESETS = {
 
 def connect(cfg):
     """The arm behind its guard; UserError where there is no such class, or a setting is not within its limits."""
-    for name, most in (*((name, np.inf) for name in vars(hardware.Gaps())), ("think", 1 / task.RATE)):
-        if not 0 <= getattr(cfg, name) < most:
-            raise UserError(f"--{name} {getattr(cfg, name)}: at least 0, and {'finite' if most == np.inf else 'below 1/15 s'}")
+    if not cfg.think < 1 / task.RATE or np.inf in (getattr(cfg, name) for name in vars(hardware.Gaps())):
+        raise UserError("--think is below 1/15 s, and every gap of the simulated arm finite")
     module, _, name = cfg.arm.partition(":")
     try:  # whatever goes wrong in somebody's class
         make = hardware.SimulatedArm if cfg.arm == "simulated" else getattr(importlib.import_module(module), name)
-        return safety.Guarded(make(cfg))
+        arm = make(cfg)
     except Exception as error:
         raise UserError(f"--arm {cfg.arm}: {type(error).__name__}: {error}; say simulated, or module:Class") from None
+    if not isinstance(arm, hardware.Arm):
+        raise UserError(f"--arm {cfg.arm}: it has not all that common/robot/hardware.py's Arm has")
+    if cfg.camera and isinstance(arm, hardware.SimulatedArm):
+        raise UserError(f"--camera {cfg.camera}: the simulated arm has its own")
+    return safety.Guarded(arm)
 
 
 def prepare(arm, cfg, scenario, k, world=World()):
-    """Box and look-pose of run k of a scenario. Returns from when to when a hand covers the tags, in s."""
+    """Box and look-pose of run k of a scenario, of a safety.Guarded. Returns from when to when a hand covers the tags, in s."""
     rng = np.random.default_rng([cfg.seed, SCENARIOS.index(scenario), k, 4])
     torch.manual_seed(int(rng.integers(2**62)))  # of the dropout masks
     start = rng.uniform(1, 5)
     hand = {"natural": (np.inf, np.inf), "hand_5s": (start, start + 5), "hand_full": (start, np.inf)}[scenario]
-    if not isinstance(arm, hardware.SimulatedArm):
+    if not arm.simulated:
         try:
             input(f"{scenario}, run {k + 1}: place the box, bring the pusher to where the camera sees it, and press Enter ")
         except EOFError:
@@ -84,17 +88,17 @@ def prepare(arm, cfg, scenario, k, world=World()):
     env = PushVectorEnv(1, world=world)
     while True:  # a start of the study from which the camera sees the box
         env.reset(seed=int(rng.integers(2**31)))
-        arm.place(rng, env.box[0], env.pusher[0], env.dynamics, hand)
-        if tags.Tracker().update(arm.grab()[1], scene.wrist_camera(arm.model, arm.joints)).seen is not None:
+        arm.simulated.place(rng, env.box[0], env.pusher[0], env.dynamics, hand)
+        if tags.Tracker().update(arm.arm.grab()[1], scene.wrist_camera(arm.model, arm.arm.joints)).seen is not None:
             return hand
 
 
 def sense(arm, tracker):
     """grab -> track. The first columns of a tick's row: see runlog.log_of."""
-    (taken, image), (now, q) = arm.grab(), arm.joints
+    (now, q), force, (taken, image) = arm.joints, arm.force, arm.grab()
     _, points, rotation = arm.model.chain(q)
     sight = tracker.update(image, scene.wrist_camera(arm.model, arm.joints_then(taken)))
-    return dict(time=now, joints=q, points=points, pusher=points[-1, :2], force=(rotation @ arm.force)[:2], image=image,
+    return dict(time=now, joints=q, points=points, pusher=points[-1, :2], force=(rotation @ force)[:2], image=image,
                 **vars(sight))
 
 
@@ -118,7 +122,7 @@ def control(drive, f, pi, cfg, hand, rows, screen):
     `drive` is a controller.Controller, `hand` (from, to) in s for who covers the tags of a real arm; `rows` is a list that gets
     a dict a tick, which the page.Page `screen` shows, if there is one.
     """
-    arm, simulated = drive.arm, isinstance(drive.arm.arm, hardware.SimulatedArm)
+    arm, simulated = drive.arm, drive.arm.simulated
     cues = {int(moment * task.RATE): f"now {word} the tags" for moment, word in zip(hand, ("cover", "uncover")) if moment < 60}
     tracker, memory, certain = tags.Tracker(), None, 0
     for _ in range(PATIENCE):
@@ -132,7 +136,7 @@ def control(drive, f, pi, cfg, hand, rows, screen):
     for tick in range(task.HORIZON):
         began = time.perf_counter()
         row = sense(arm, tracker) if tick else row
-        row |= dict(true=arm.arm.box.copy() if simulated else np.full(3, np.nan), covered=simulated and arm.arm.covered)
+        row |= dict(true=simulated.box.copy() if simulated else np.full(3, np.nan), covered=bool(simulated and simulated.covered))
         s_hat, action, memory = think(f, pi, cfg.passes, row, memory)
         arm.require(np.isfinite(s_hat).all(), "the estimate is not finite")
         drive.aim(task.SPEEDS[action])
@@ -144,11 +148,11 @@ def control(drive, f, pi, cfg, hand, rows, screen):
         rows.append(row)
         if screen:
             screen.show(row, tick)
-        box, pusher = arm.arm.box if simulated else row["estimated"], arm.model.chain(arm.joints[1])[1][-1, :2]
+        box, pusher = simulated.box if simulated else row["estimated"], arm.model.chain(arm.joints[1])[1][-1, :2]
         certain = certain + 1 if task.reached(box) else 0
         if certain >= (1 if simulated else CERTAIN):
             return "success" if simulated else "success by estimate"
-        if simulated and arm.arm.ended:
+        if simulated and simulated.ended:
             return "ended on the page"
         if task.outside(box, pusher):
             return "out of the workspace"
@@ -158,18 +162,18 @@ def control(drive, f, pi, cfg, hand, rows, screen):
 def perform(arm, f, pi, run, logs, scenario, k, screen):
     """Run k of a scenario, its film and figure, and last its log, by which a rerun knows it; Stop where the arm was stopped."""
     rows, stop, name = [], None, f"{scenario}_{k:03d}"
-    hand = prepare(arm.arm, run.cfg, scenario, k, run.world)
-    threaded = run.cfg.realtime or not isinstance(arm.arm, hardware.SimulatedArm)
+    hand = prepare(arm, run.cfg, scenario, k, run.world)
+    arm.check()  # what was stopped before a run is no failure of it
     if screen:
         screen.begin(f"{scenario}, run {k + 1}")
     try:
-        with controller.Controller(arm, threaded, run.cfg.think) as drive:
+        with controller.Controller(arm, run.cfg.realtime or not arm.simulated, run.cfg.think) as drive:
             ended = control(drive, f, pi, run.cfg, hand, rows, screen)
     except safety.Stop as reason:
-        if isinstance(arm.arm, hardware.SimulatedArm) and isinstance(reason.__context__, KeyboardInterrupt):
+        if arm.simulated and isinstance(reason.__context__, KeyboardInterrupt):
             raise  # not the policy's failure: the same command plays the run again
         ended, stop = "stopped", reason
-    log = runlog.log_of(rows, ended, getattr(arm.arm, "joined", False))
+    log = runlog.log_of(rows, ended, bool(arm.simulated and arm.simulated.joined))
     if rows and run.cfg.video:
         views.write(rows, run.dir / f"{name}.mp4", run.dir / f"{name}_camera.mp4")
     others = [runlog.worth(other) for done in logs.values() for other in done.values() if "age" in other]
@@ -236,9 +240,8 @@ def main(cfg):
         if screen:
             screen.arm = arm
             print(f"see http://127.0.0.1:{screen.server_port}")
-        clock = (lambda: arm.arm.time) if isinstance(arm.arm, hardware.SimulatedArm) else time.monotonic
         own = contextlib.nullcontext(arm.camera)
-        with hardware.VideoCamera(cfg.camera, clock, cfg.latency / task.RATE) if cfg.camera else own as arm.camera:
+        with hardware.VideoCamera(cfg.camera, cfg.latency / task.RATE) if cfg.camera else own as arm.camera:
             play(cfg, arm, f, pi, paths, scenarios, screen)
 
 

@@ -39,6 +39,7 @@ class Arm:
         self.model, self.rng, self.rate, self.joints, self.clock = model, rng, rate, start.copy(), 0.0
         self.stopped, self.must, self.faults, self.unsafe, self.equal, self.stale = False, "", 0, [], 0, 0
         self.kept, self.since, self.image, self.frozen = (0.0, start.copy()), 0, -1, False
+        self.stuck, self.moves, self.alike = False, False, 0
 
     def fault(self, share=1.0):
         happens = self.rng.random() < self.rate * share
@@ -75,6 +76,11 @@ class Arm:
         elif self.stale or self.fault(0.2):  # the driver delivers its last reading for a while
             self.stale = self.stale - 1 if self.stale else self.rng.integers(1, 40)
             time, q = self.kept
+        elif self.stuck or self.fault(0.05):  # the encoders stand still, and their times do not
+            self.stuck, q = True, self.kept[1]
+        self.alike = self.alike + 1 if self.moves and q is self.kept[1] else 0
+        if self.alike > safety.STUCK:
+            self.fatal("joints: stuck")
         self.since = self.since + 1 if time == self.kept[0] else 0
         if self.since > 8 + ik.QP_RATE * safety.SENSOR_AGE:
             self.fatal("joints: stale")
@@ -125,6 +131,7 @@ class Arm:
         tip = self.model.jacobian(axes, points)[:3] @ velocity
         if np.linalg.norm(tip) > SLACK * safety.TIP or np.linalg.norm(tip[:2]) > SLACK * safety.TIP_XY:
             self.unsafe.append(f"pusher at {tip} m/s")
+        self.moves = np.linalg.norm(tip) > SLACK * safety.MOVES
         self.joints = self.joints + velocity / ik.QP_RATE
         place = self.model.chain(self.joints)[1][-1]
         beyond, rise = (np.abs(place[:2]) > safety.BORDER + 0.002).any(), abs(place[2] - self.model.height)
@@ -197,7 +204,7 @@ def fuzz(ticks, seed=0, model=IIWA):
                 reasons[re.sub(r"-?\d[\d.]*|inf|nan", "#", str(stop)).partition("arm stopped: ")[2][:50]] += 1
             except BaseException as error:
                 escaped.append(repr(error))
-            arm.must = arm.must or "the end"
+            arm.must, arm.rate = arm.must or "the end", 0.0
             for late in (zeros, small) if played > before else ():  # as a thread that has not noticed
                 try:
                     guard.command(late)

@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 from common import command, episodes, film, networks, runs, stacks, statistics, tables, task, weights
 from common.files import UserError
 from common.progress import bar
-from common.robot import hardware, runlog
+from common.robot import hardware, runlog, safety
 
 REPEATS = 5
 robot = importlib.import_module("06_robot")
@@ -34,7 +34,7 @@ def main(cfg):
              runs.find(cfg, "04_train_policy", "policy.safetensors", "est_uncertainty")]
     world, arm, starts = runs.world_of(cfg, paths), hardware.SimulatedArm(cfg), []
     for k in bar(logs, "starts", unit="run"):
-        robot.prepare(arm, cfg, "natural", k, world)
+        robot.prepare(safety.Guarded(arm), cfg, "natural", k, world)
         dynamics = {name: value[0] for name, value in arm.worlds.dynamics.items()}
         starts.append({"box": arm.box.copy(), "pusher": arm.points[-1, :2]} | dynamics)
     starts = {key: np.array([start[key] for start in starts]) for key in starts[0]}

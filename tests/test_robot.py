@@ -5,28 +5,12 @@ import cv2
 import numpy as np
 import pytest
 import qpsolvers
+from robot_arms import STILL, placed
 from six_joints import SIX
 
 from common import simulator, task
 from common.robot import hardware, ik, scene, tags
 from common.robot.iiwa import IIWA
-
-STILL = hardware.Gaps(latency=0, hand_eye_mm=0, hand_eye_deg=0, servo_lag=0, tool_mass=0, force_bias=0, force_noise=0)
-DYNAMICS = {"mass": 3.2, "mu_static": 0.4, "mu_dynamic": 0.2, "mu_pusher": 0.2, "restitution": 0.3, "limit_surface_c": 0.06}
-
-
-@pytest.fixture(params=[IIWA, SIX], ids=["iiwa", "six joints"])
-def model(request):
-    return request.param
-
-
-def placed(gaps=STILL, box=(0.0, 0.0, 0.0), pusher=(-0.1, 0.0), hand=(np.inf, np.inf), seed=0, model=IIWA):
-    arm = hardware.SimulatedArm(gaps)
-    arm.model = model
-    dynamics = {name: np.array([value]) for name, value in DYNAMICS.items()}
-    arm.place(np.random.default_rng(seed), np.array(box, float), np.array(pusher, float), dynamics, hand)
-    return arm
-
 
 # The arm's kinematics
 

@@ -1,10 +1,9 @@
-"""What stage 06 needs of an arm and a camera, a simulated arm behind it, and any OpenCV video source as the camera."""
+"""What stage 06 needs of an arm and a camera, a simulated arm behind it, and a camera that OpenCV opens."""
 import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -16,11 +15,12 @@ from common.robot.iiwa import IIWA
 from common.robot.model import Model
 
 
+@runtime_checkable
 class Arm(Protocol):
     """The model and the five methods that attach an arm of n joints, a force sensor, a camera; SI units, time.monotonic().
 
-    Joints and wrench are read and `command` is called 150 times a second by one thread, `grab` 15 times by another, and `stop`
-    by either, never within a `command`: readings are at most 50 ms old, no method waits.
+    Joints and wrench are read and `command` is called 150 times a second by one thread, `grab` 15 times by another; `stop` may
+    be any thread's, within a `command` only where that hangs. Readings are at most 50 ms old, no method waits.
     """
 
     model: Model
@@ -65,14 +65,14 @@ class SimulatedArm:
     def place(self, rng, box, pusher, dynamics, hand=(np.inf, np.inf)):
         """Starts anew: box (3,), pusher (2,), dynamics as simulator.Worlds.place takes them, from when to when a hand (s)."""
         g, self.rng, self.time, self.hand = self.gaps, rng, 0.0, hand
-        self.joined, self.ended, self.held, self.nudges = False, False, 0.0, deque(maxlen=100)
         self.worlds.place(np.arange(1), box[None], pusher[None], dynamics)
         self.joints, self.speeds = self.model.joints_at(pusher), np.zeros(len(self.model.limits))
         self.points, self.rotation = self.model.chain(self.joints)[1:]
         self.velocity = self.acceleration = np.zeros(3)  # of the ball
         self.error = rng.normal(0, [g.hand_eye_mm / 1e3] * 3 + [np.deg2rad(g.hand_eye_deg)] * 3)
         self.bias, self.noise = rng.normal(0, g.force_bias, 3), rng.normal(0, g.force_noise, 3)  # N
-        self.past = deque(maxlen=1 + round(g.latency * ik.QP_RATE / task.RATE))
+        self.past = deque(maxlen=1 + round(g.latency * ik.STEPS))
+        self.joined, self.ended, self.held, self.nudges = False, False, 0.0, deque(maxlen=100)
         self.remember()
 
     @property
@@ -129,40 +129,37 @@ class SimulatedArm:
 
 
 class VideoCamera:
-    """A camera that OpenCV opens: of a device number or an address always the newest image, of a file each image in turn.
+    """A camera that OpenCV opens, by its number or address: always the newest image, for which nobody waits.
 
-    clock() tells the arm's time in s, latency is from an exposure to its reading, in s; UserError if OpenCV cannot open it.
-    Leaving it ends its thread and gives the device back, unless the device hangs.
+    `latency` is from an exposure to its reading, in s; UserError if OpenCV cannot open it. Leaving it ends its thread and gives
+    the device back, unless the device hangs.
     """
 
-    def __init__(self, source, clock, latency):
+    def __init__(self, source, latency):
         self.capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
         if not self.capture.isOpened():
-            raise UserError(f"--camera {source}: OpenCV cannot open it; give a device number, a file or an address")
-        self.clock, self.latency, self.live = clock, latency, not Path(source).is_file()
-        self.thread = threading.Thread(target=self.follow, daemon=True)  # nobody waits for an image while the arm moves
-        self.left = False
-        if self.live:
-            self.newest = self.read()
-            self.thread.start()
+            raise UserError(f"--camera {source}: OpenCV cannot open it; give a device number or an address")
+        self.latency, self.left = latency, False
+        self.newest = self.read()
+        self.thread = threading.Thread(target=self.follow, daemon=True)
+        self.thread.start()
 
     def __enter__(self):
         return self
 
     def __exit__(self, *error):
         self.left = True
-        if self.live:
-            self.thread.join(1.0)
+        self.thread.join(1.0)
         if not self.thread.is_alive():
             self.capture.release()
 
     def read(self):
         good, image = self.capture.read()
-        return self.clock() - self.latency, image if good else None
+        return time.monotonic() - self.latency, image if good else None
 
     def follow(self):
         while not self.left and self.newest[1] is not None:
             self.newest = self.read()
 
     def grab(self):
-        return self.newest if self.live else self.read()
+        return self.newest

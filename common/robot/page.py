@@ -80,7 +80,7 @@ class Page(ThreadingHTTPServer):
             super().__init__(("127.0.0.1", port, *more), Request)
         except (OSError, OverflowError, TypeError) as error:
             raise UserError(f"--view {port}: this port cannot be had ({error}); give another") from None
-        self.fresh, self.history, self.drawing = threading.Event(), deque(maxlen=task.HORIZON), True
+        self.fresh, self.history = threading.Event(), deque(maxlen=task.HORIZON)
         self.pipe, far = multiprocessing.Pipe()
         self.painter = subprocess.Popen(  # a session of its own: Ctrl-C is for the program alone
             [sys.executable, "-m", "common.robot.page", str(far.fileno())], cwd=Path(__file__).parents[2],
@@ -92,10 +92,9 @@ class Page(ThreadingHTTPServer):
             thread.start()
 
     def __exit__(self, *error):
-        self.drawing = False
-        self.fresh.set()
         self.painter.kill()  # whatever it does: the thread that waits for it ends too
         self.painter.wait()
+        self.fresh.set()
         self.shutdown()
         self.server_close()
         for thread in self.threads:
@@ -110,19 +109,20 @@ class Page(ThreadingHTTPServer):
     def show(self, row, tick):
         """A tick of 06_robot.control, to be drawn when there is time, if it is the newest then."""
         self.history.append(views.curves_of(row))
-        self.latest = row, tick
+        self.latest = row, tick, list(self.history)
         self.fresh.set()
 
     def draw(self):
         with contextlib.suppress(EOFError, OSError):  # where the painter has gone the last image stays
-            while self.fresh.wait() and self.drawing:
+            while self.fresh.wait():
                 self.fresh.clear()
-                self.pipe.send((*self.latest, list(self.history)))
+                self.pipe.send(self.latest)
                 self.jpeg = self.pipe.recv_bytes()
 
     def state(self):
         """The run, and what the guard says."""
-        joined = " (joined, not counted)" if getattr(getattr(self.arm, "arm", None), "joined", False) else ""
+        simulated = getattr(self.arm, "simulated", None)
+        joined = " (joined, not counted)" if simulated and simulated.joined else ""
         return f"{self.title}{joined}: {getattr(self.arm, 'stopped', '') or 'the guard is content'}"
 
     def act(self, word, *numbers):
@@ -133,8 +133,8 @@ class Page(ThreadingHTTPServer):
             raise ValueError
         if word == "stop":
             self.arm.halt("the page's stop button")
-        if hasattr(self.arm.arm, "join"):
-            self.arm.arm.join(word, way)
+        elif self.arm.simulated:
+            self.arm.simulated.join(word, way)
 
     def handle_error(self, *connection):
         """A tab that was closed is no matter."""
@@ -148,7 +148,7 @@ class Request(BaseHTTPRequestHandler):
         return self.headers.get("Host") in [f"{name}:{self.server.server_port}" for name in ("127.0.0.1", "localhost")]
 
     def do_GET(self):
-        join = self.server.arm is None or hasattr(self.server.arm.arm, "join")
+        join = self.server.arm is None or self.server.arm.simulated
         parts = {"/": (HTML.replace("JOIN", "" if join else "hidden").encode(), "text/html"),
                  "/frame": (self.server.jpeg, "image/jpeg")}
         if not self.own() or self.path not in parts:
@@ -166,8 +166,9 @@ class Request(BaseHTTPRequestHandler):
 
     def answer(self, code, body=b"", kind="text/plain"):
         self.send_response(code)
-        for name, value in {"Content-Type": kind, "Content-Length": len(body), "State": json.dumps(self.server.state()),
-                            "Cache-Control": "no-store", "Content-Security-Policy": "frame-ancestors 'none'"}.items():
+        state = {"State": json.dumps(self.server.state())} if code == 200 else {}
+        for name, value in {"Content-Type": kind, "Content-Length": len(body), "Cache-Control": "no-store",
+                            "Content-Security-Policy": "frame-ancestors 'none'", **state}.items():
             self.send_header(name, str(value))
         self.end_headers()
         self.wfile.write(body)

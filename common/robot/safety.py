@@ -11,12 +11,13 @@ import numpy as np
 
 from common import task
 from common.files import UserError
-from common.robot import ik, scene
+from common.robot import hardware, ik, scene
 
 FORCE, PEAK = 40.0, 100.0  # N: of the mean over a control step, and of one reading
 SENSOR_AGE, CAMERA_AGE = 0.05, 0.5  # s, of the newest joint angles and wrench, and of the newest image
 EARLY = 0.02  # s that a time may be ahead of that of the joint angles
 FROZEN = 5  # equal images in a row: a live camera's noise never repeats
+STUCK, MOVES = 15, 0.005  # equal joint angles in a row, while the pusher is told to move, at more than so many m/s
 UNSOLVED = 3  # programs in a row
 JOINT_GAP = np.deg2rad(0.5)  # rad to a joint's limit; the program keeps 2 degrees
 OVERSPEED = 1.1  # times a joint's largest speed: what its readings may show
@@ -35,12 +36,14 @@ class Guarded:
     """An Arm whose readings are whole, new and within limits, or which has stopped for good and raised Stop.
 
     As a context it is the time in which the arm can move: a signal or an exception inside is a Stop, and it ends with the
-    arm's own stop. `arm` is a hardware.Arm; `camera` has grab(), and is the arm itself until it is set. Joints, wrench and
-    commands may be one thread's and images another's; `halt` is any thread's.
+    arm's own stop. `arm` is a hardware.Arm, `simulated` the same if it is a SimulatedArm, else None; `camera` has grab(), and is
+    the arm itself until it is set. Joints, wrench and commands may be one thread's and images another's; `halt` is any thread's.
     """
 
     def __init__(self, arm):
-        self.arm, self.camera, self.stopped, self._lock = arm, arm, "", threading.Lock()
+        self.arm, self.camera, self.model, self.stopped = arm, arm, arm.model, ""
+        self.simulated = arm if isinstance(arm, hardware.SimulatedArm) else None
+        self._lock, self._halted = threading.Lock(), False
 
     def __enter__(self):
         self._handlers = {number: signal.signal(number, self._signalled) for number in SIGNALS
@@ -49,31 +52,31 @@ class Guarded:
 
     def __exit__(self, kind, error, trace):
         try:
+            for number in self._handlers:
+                signal.signal(number, signal.SIG_IGN)  # the arm is stopped here, whatever is asked
             if error:
                 self.fail(error)
-            self.halt("the program has ended")
-            if not self.stopped.startswith("arm stopped"):
-                raise Stop(self.stopped)
         finally:
+            self.halt("the program has ended")
             for number, handler in self._handlers.items():
                 signal.signal(number, handler)
             _let_print()
+        if not self.stopped.startswith("arm stopped"):
+            raise Stop(self.stopped)
 
     def _signalled(self, number, frame):
-        """Only notes the reason, and lets the exception stop the arm: the signal may have come within a call of the driver."""
-        if not self.stopped:
-            self.stopped = f"arm stopped: {SIGNALS[number]}"
-            raise KeyboardInterrupt
+        """Only notes the reason, and lets the exception stop the arm: the signal may have come within a call of the driver.
 
-    @property
-    def model(self):
-        """The arm's model.Model."""
-        return self.arm.model
+        Between the first reason and the arm's stop another signal changes nothing; after it, it ends what still waits.
+        """
+        first, self.stopped = not self.stopped, self.stopped or f"arm stopped: {SIGNALS[number]}"
+        if first or self._halted:
+            raise KeyboardInterrupt
 
     def begin(self):
         """A run begins: what was read before does not count."""
         self._joints, self._forces = deque(maxlen=ik.QP_RATE), deque(maxlen=ik.STEPS)  # a second's, a tick's
-        self._renewed, self._again, self._unsolved, self._equal, self._image = wall.monotonic(), 0, 0, 0, None
+        self._moving, self._still, self._unsolved, self._equal, self._image = False, 0, 0, 0, None
         self.read_joints(), self.read_wrench()
 
     def halt(self, reason):
@@ -88,6 +91,7 @@ class Guarded:
         finally:
             if mine:
                 self._lock.release()
+            self._halted = True
 
     def stop(self, reason):
         """Stops the arm for good, and raises Stop."""
@@ -98,8 +102,8 @@ class Guarded:
         """Stops the arm for an exception, and raises Stop with one line of it; not where it is a line already, a UserError."""
         if isinstance(error, UserError):
             return self.halt(error)
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        failure = f"{type(error).__name__} in {Path(place.filename).name}, line {place.lineno}: {error}"
+        *_, (frame, line) = traceback.walk_tb(error.__traceback__)  # reads no file
+        failure = f"{type(error).__name__} in {Path(frame.f_code.co_filename).name}, line {line}: {error}"
         self.stop("Ctrl-C" if isinstance(error, KeyboardInterrupt) else failure)
 
     def require(self, good, reason):
@@ -108,10 +112,12 @@ class Guarded:
             self.stop(reason)
 
     def read_joints(self):
-        """Time and joint angles (n,) in rad."""
+        """Looks at the arm's joint angles, which are `joints` then."""
         time, q = self.arm.read_joints()
         whole = np.shape(q) == self.model.limits.shape and np.isfinite(time) and np.isfinite(q).all()
         self.require(whole, f"joint angles: not {len(self.model.limits)} numbers")
+        age = 0 if self.simulated else wall.monotonic() - time
+        self.require(-EARLY <= age <= SENSOR_AGE, f"joint angles: {age:.2f} s old")
         q = np.array(q, float)
         for i in np.flatnonzero(np.abs(q) > self.model.limits - JOINT_GAP):
             self.stop(f"joint {i + 1} is at its limit, {np.rad2deg(q[i]):.1f} degrees")
@@ -126,12 +132,10 @@ class Guarded:
         within = np.clip(time - last, 1 / ik.QP_RATE, SENSOR_AGE)
         for i in np.flatnonzero(np.abs(q - before) > OVERSPEED * self.model.speeds * within):
             self.stop(f"joint {i + 1} is over its speed, {np.rad2deg(q - before)[i]:.1f} degrees in {within:.3f} s")
-        if not self._joints or time > self._joints[-1][0]:
+        self._still = self._still + 1 if self._moving and np.array_equal(q, before) else 0
+        self.require(self._still < STUCK, "joint angles: the same, while they are told to move")
+        if not self._joints or time > last:
             self._joints.append((time, q))
-            self._renewed, self._again = wall.monotonic(), 0
-        self._again += 1
-        self.require(self._again <= 8 or wall.monotonic() - self._renewed <= SENSOR_AGE, "joint angles: nothing new")
-        return time, q
 
     @property
     def joints(self):
@@ -148,14 +152,13 @@ class Guarded:
         self.require(-EARLY <= age <= oldest, f"{sensor}: the newest is {age:.2f} s old")
 
     def read_wrench(self):
-        """Time and force (3,) in N, tool frame. Call it after read_joints."""
+        """Looks at the arm's force, of which `force` is the mean then. Call it after read_joints."""
         time, force = self.arm.read_wrench()
         self.require(np.shape(force) == (3,) and np.isfinite(force).all(), "wrench: not three numbers")
         self._check_age("wrench", time, SENSOR_AGE)
         self._forces.append(np.array(force, float))
         mean, peak = np.linalg.norm(self.force), np.linalg.norm(force)
         self.require(mean <= FORCE and peak <= PEAK, f"force of {mean:.0f} N, over {FORCE:.0f} N, or peak of {peak:.0f} N")
-        return time, force
 
     @property
     def force(self):
@@ -169,7 +172,7 @@ class Guarded:
         shape, due = np.shape(image), (*scene.SIZE[::-1], 3)
         self.require(shape == due, f"camera: images of shape {shape}, not {due} as common/robot/scene.py has it")
         self._check_age("camera", time, CAMERA_AGE)
-        self._equal = self._equal + 1 if self._image is not None and np.array_equal(image, self._image) else 0
+        self._equal = self._equal + 1 if np.array_equal(image, self._image) else 0
         self._image = image.copy()
         self.require(self._equal < FROZEN, f"camera: frozen, {FROZEN + 1} equal images")
         return time, self._image
@@ -180,13 +183,17 @@ class Guarded:
         self._unsolved = self._unsolved + 1 if velocity is None else 0
         self.require(self._unsolved < UNSOLVED, f"{UNSOLVED} programs in a row were not solved")
         velocity = np.zeros(len(self.model.limits)) if velocity is None else velocity
-        self.require((np.abs(velocity) <= 1.001 * self.model.speeds).all(), "a joint velocity is not within its limit")
+        within = np.shape(velocity) == self.model.limits.shape and (np.abs(velocity) <= 1.001 * self.model.speeds).all()
+        self.require(within, "a joint velocity is not within its limit")
         tip = self._jacobian @ velocity
         speed, speed_xy = np.linalg.norm(tip), np.linalg.norm(tip[:2])
         self.require(speed <= TIP and speed_xy <= TIP_XY, f"the pusher would move at {speed:.3f} m/s")
         with self._lock:
             self.check()
             self.arm.command(velocity)
+            if self.stopped:  # by a thread that waited no longer for the driver
+                self.arm.stop()
+        self._moving = speed > MOVES
 
     def check(self):
         """Raises Stop where the arm has been stopped."""
