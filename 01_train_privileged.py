@@ -52,7 +52,7 @@ def main(cfg):
     limit = min(1000, cfg.updates + 1)
     if not 2 <= cfg.checkpoints <= limit:
         raise UserError(f"--checkpoints {cfg.checkpoints}: say 2 to {limit}; at most --updates and one more, or 1000")
-    device = command.device_of(cfg)
+    device, worlds = command.device_of(cfg), training.shares(cfg)
     run = runs.Run(cfg, "01_train_privileged")
     if run.skip():
         return
@@ -67,7 +67,7 @@ def main(cfg):
         if update in spaced:
             weights.save(run.dir / names[spaced[update]], actor)
 
-    env, held_out = (stacks.make(stacks.METHODS["priv_on_state"], n, world=cfg.world) for n in training.shares(cfg))
+    env, held_out = (stacks.make(stacks.METHODS["priv_on_state"], n, world=cfg.world) for n in worlds)
     if not training.train(run, cfg, env, held_out, pi_priv, critic, keep) or ranks.RANK:
         return
     weights.save(run.dir / "policy.safetensors", pi_priv)

@@ -75,6 +75,7 @@ def main(cfg):
     for method in TRAINED if cfg.method == "all" else [cfg.method]:
         cfg = replace(cfg, method=method)
         train_set, paths = trajectories.load_set(cfg, "train")
+        supervised.check(train_set, cfg.sequences)
         validation_set, validation_paths = trajectories.load_set(cfg, "validation")
         reads = {field.name for field in fields(cfg)} - ({"dropout"} if not TRAINED[method].dropout else set())
         run = runs.Run(cfg, "03_train_estimator", paths | validation_paths, method, reads)

@@ -80,14 +80,16 @@ def settings_of(cfg):
 def inputs_of(cfg):
     """Paths of what a method reads.
 
-    Raises UserError: something is missing, or does not fit.
+    Raises UserError: something is missing, or does not fit, or there are too many processes.
     """
     def nets(*names):
         return {name: runs.find(cfg, "01_train_privileged", f"{name}.safetensors") for name in names}
 
     if TRAINED[cfg.method].training == "cloning":
-        train, validation = (trajectories.load_set(cfg, f"teacher_{name}")[1] for name in ("train", "validation"))
+        (data, train), (_, validation) = (trajectories.load_set(cfg, f"teacher_{name}") for name in ("train", "validation"))
+        supervised.check(data, cfg.bc_sequences)
         return nets("policy") | train | validation
+    training.shares(cfg)
     paths = nets("policy", "value") if cfg.warm_start else {}
     if kind := TRAINED[cfg.method].estimator:
         found = stacks.find_estimator(cfg, kind)

@@ -61,13 +61,16 @@ def trained(cfg):
     estimators, policies, left_out = {}, {}, []
     for kind in reversed(ESTIMATORS):  # the order of tab. estimator_ablation
         try:
-            estimators[kind] = stacks.find_estimator(cfg, kind)
-        except runs.Missing:
+            paths = stacks.find_estimator(cfg, kind)
+            if kind not in TRAINED:  # seeds of two studies are no ensemble
+                runs.check_lineage(cfg, paths[0].parent, runs.hashes_of(cfg, [pi_priv, *paths]))
+            estimators[kind] = paths
+        except (runs.Missing, runs.Mixed):
             if kind in TRAINED:
                 left_out.append(f"estimator {kind}")
     for name, method in METHODS.items():
         stage, folder = ("01_train_privileged", None) if method.training == "pi_priv" else ("04_train_policy", name)
-        for k in sorted({0, *runs.seeds(cfg.roots, stage, folder)}):
+        for k in sorted({*[0] * method.published, *runs.seeds(cfg.roots, stage, folder)}):
             label = f"{name}, seed {k}" if k else name
             try:
                 path = runs.find(cfg, stage, "policy.safetensors", folder, k)
@@ -76,8 +79,7 @@ def trained(cfg):
                 runs.check_lineage(cfg, path.parent, runs.hashes_of(cfg, [pi_priv, *sum(estimators.values(), []), path]))
                 policies[name, k] = path
             except runs.Missing:
-                if method.published:
-                    left_out.append(label)
+                left_out.append(label)
             except runs.Mixed:
                 left_out.append(f"{label} (on other nets than these)")
     return estimators, policies, left_out
@@ -143,8 +145,8 @@ def report(run):
 
 
 def draw(run, players, results, done):
-    """Every figure that the methods measured allow, and the film; returns which episodes they show."""
-    cfg, shown = run.cfg, {}
+    """Every figure that the methods measured allow, and the film."""
+    cfg = run.cfg
     for old in (*run.dir.glob("*.png"), *run.dir.glob("film.*")):
         old.unlink()
     levels = {m: row["mean"] for m, row in results["success_rate"].items() if METHODS[m].training != "rl"}
@@ -170,15 +172,12 @@ def draw(run, players, results, done):
         plots.trajectory_with_uncertainty(
             {m: players.episode(Measurement(m, len(ours), occlusion=math.inf), first) for m in pair},
             run.dir / "trajectory_with_uncertainty.png", len(cases), len(ours), first, players.world.box)
-        shown["trajectory_with_uncertainty"] = {"episode": first, "cases": len(cases), "episodes": len(ours)}
     if "est_uncertainty" in results["success_rate"]:
         success, length, env = players.chunk(Measurement("est_uncertainty", cfg.episodes), 0)
         hidden = np.array([env.episode(i, n)["o"][:, 8].sum() for i, n in enumerate(length)])
         long = np.flatnonzero(success & (hidden >= 5 * task.RATE))  # the first success with 5 s of occlusion
         world = int(long[0]) if long.size else 0
         film.write(env.episode(world, length[world]), run.dir / "film.mp4", run.dir / "film.gif", players.world)
-        shown["film"] = {"episode": world}
-    return shown
 
 
 def main(cfg):
@@ -216,7 +215,8 @@ def main(cfg):
     done = {name: kept[key] for name, key in keys.items()}
     results = statistics.summarise(done)
     write_atomic(run.dir / "tables.md", lambda path: path.write_text(tables.every(results)))
-    save_json(run.dir / "results.json", results | draw(run, players, results, done))
+    draw(run, players, results, done)
+    save_json(run.dir / "results.json", results)
     run.finish(["results.json", "tables.md"])
     report(run)
 

@@ -1,6 +1,5 @@
 """Is sigma true? Coverage, NLL, CRPS and NEES of predicted Gaussians, and whether sigma foresees a failure."""
 import math
-from statistics import NormalDist
 
 import numpy as np
 import torch
@@ -8,13 +7,13 @@ import torch
 from common import task
 
 UNITS = np.array([1e3, 1e3, np.rad2deg(1)])  # x, y in mm, theta in degrees
-LEVELS = (0.25, 0.5, math.erf(1 / 2**0.5), 0.8, 0.9, math.erf(2 / 2**0.5))  # of central intervals; 1 and 2 sigma among them
-BOUNDS = [NormalDist().inv_cdf((1 + level) / 2) for level in LEVELS]  # the same in sigmas
+BOUNDS = (0.32, 0.67, 1.0, 1.28, 1.64, 2.0)  # of central intervals, in sigmas
+LEVELS = [math.erf(bound / 2**0.5) for bound in BOUNDS]  # the share of a Gaussian within each: 25, 50, 68, 80, 90, 95 %
 EDGES = np.geomspace(1, 32, 6)  # mm, of sigma in x and y together: error against sigma
 AGES = range(11)  # s since the box was last seen
 SOON = 2 * task.RATE  # steps within which a failure is to be foreseen
 TALLIES = ("calibration", "scaled")  # of the predicted sigma, and of it times the scale that the validation set gave
-PARTS = {"steps": 1, "ratios": 4, "within": 3 * len(LEVELS), "nll": 3, "crps": 3, "count": len(EDGES) + 1,
+PARTS = {"ratios": 4, "within": 3 * len(LEVELS), "nll": 3, "crps": 3, "count": len(EDGES) + 1,
          "squares": len(EDGES) + 1, "variances": len(EDGES) + 1, "aged": len(AGES), "nees": len(AGES)}  # of a tally: widths
 
 
@@ -44,13 +43,13 @@ def tally(q_hat, variance, q, occluded, mask):
     z, mask = np.abs(error) / sigma, mask > 0
     crps = sigma * (z * torch.special.erf(torch.as_tensor(z / 2**0.5)).numpy()
                     + (2 / np.pi)**0.5 * np.exp(-z**2 / 2) - np.pi**-0.5)
-    spread, off = (np.hypot(*np.moveaxis(x[..., :2], -1, 0)) for x in (sigma, error))
+    spread, off = (np.linalg.norm(x[..., :2], axis=-1) for x in (sigma, error))
     bins = np.digitize(spread, EDGES)[..., None] == np.arange(len(EDGES) + 1)
     steps = np.arange(len(mask))[:, None]
     age = steps - np.maximum.accumulate(np.where(occluded > 0, 0, steps))
     aged = age[..., None] == task.RATE * np.array(AGES)
-    terms = [np.ones_like(spread)[..., None], np.square(q_hat - q) / variance,
-             np.concatenate([z <= bound for bound in BOUNDS], -1), z**2 / 2 + np.log(2 * np.pi * sigma**2) / 2, crps,
+    terms = [np.square(q_hat - q) / variance, np.concatenate([z <= bound for bound in BOUNDS], -1),
+             z**2 / 2 + np.log(2 * np.pi * sigma**2) / 2, crps,
              bins, bins * off[..., None]**2, bins * spread[..., None]**2, aged, aged * np.square(z).sum(-1)[..., None]]
     return np.concatenate([(term * mask[..., None]).sum(0) for term in terms], 1)
 
@@ -63,15 +62,15 @@ def parts(tallies):
 def scale(tallies):
     """Factors (4,) on the standard deviations of x, y, sin and cos that make these steps the most likely."""
     sums = parts(tallies)
-    return np.sqrt(sums["ratios"].sum(0) / sums["steps"].sum()).tolist()
+    return np.sqrt(sums["ratios"].sum(0) / sums["count"].sum()).tolist()
 
 
-def bootstrap(statistic, count, draws=200):
+def bootstrap(statistic, count):
     """statistic(weights (count,)) with all weights 1, and its 95 % interval where they tell how often each of `count`
     independent ones was drawn; what a draw cannot tell is nan.
     """
     rng = np.random.default_rng(0)
-    values = [statistic(rng.multinomial(count, np.full(count, 1 / count))) for _ in range(draws)]
+    values = [statistic(rng.multinomial(count, np.full(count, 1 / count))) for _ in range(200)]
     low, high = np.nanpercentile(values, (2.5, 97.5), axis=0)
     return {"mean": statistic(np.ones(count)), "low": low, "high": high}
 
@@ -82,7 +81,7 @@ def summary(tallies):
     AGES that there are, each of so many trajectories.
     """
     sums = parts(tallies)
-    steps, ages = sums["steps"].sum(), sums["aged"].any(0).sum()  # who comes to 3 s came to 2 s
+    steps, ages = sums["count"].sum(), sums["aged"].any(0).sum()  # who comes to 3 s came to 2 s
     aged, nees = sums["aged"][:, :ages], sums["nees"][:, :ages] / 3
     curve = (sums["within"].sum(0) / steps).reshape(-1, 3).tolist()
     count = np.maximum(sums["count"].sum(0), 1)
@@ -124,7 +123,8 @@ def foreseen(courses):
     none if there is nothing to tell apart.
     """
     courses = np.asarray(courses, float)
-    (length, left), sigma = courses[np.isfinite(courses[:, 1]), :2].T, courses[np.isfinite(courses[:, 1]), 2:]
+    courses = courses[np.isfinite(courses[:, 1])]
+    (length, left), sigma = courses[:, :2].T, courses[:, 2:]
     seconds = np.arange(sigma.shape[1])
     episode, second = np.nonzero((task.RATE * seconds < length[:, None]) & (seconds > 0))
     now = sigma[episode, second]

@@ -105,18 +105,16 @@ def main(config_class: type, presets: dict[str, dict], run: Callable, doc: str):
     except BrokenPipeError:  # `--help | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
-    except OSError as failure:
+    except Exception as failure:
         known = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR)
         ranks.let_the_cause_speak(failure)
-        if failure.errno not in (None, *known):  # numpy gives no errno where the disk is full
+        if isinstance(failure, OSError) and failure.errno in (None, *known):  # numpy gives no errno where the disk is full
+            message, code = f"cannot read or write ({failure}): make room, or choose another --out", 2
+        elif ranks.COUNT == 1:
             raise
-        message, code = f"cannot read or write ({failure}): make room, or choose another --out", 2
-    except Exception as failure:
-        ranks.let_the_cause_speak(failure)
-        if ranks.COUNT == 1:
-            raise
-        traceback.print_exc()
-        os._exit(1)  # a thread of this rank may wait in a collective that the others never call
+        else:
+            traceback.print_exc()
+            os._exit(1)  # a thread of this rank may wait in a collective that the others never call
     if code == 2 or not ranks.RANK:
         print("error:", " ".join(message.split()), file=sys.stderr, flush=True)
     (sys.exit if ranks.COUNT == 1 else os._exit)(code)
@@ -127,8 +125,6 @@ def device_of(cfg: Stage) -> torch.device:
         raise UserError("--device cuda: torch finds no GPU here; use --device cpu or auto")
     if cfg.device == "cpu" or not torch.cuda.is_available():
         return torch.device("cpu")
-    if ranks.LOCAL_COUNT == 1:
-        return torch.device("cuda")
     if ranks.LOCAL_COUNT > torch.cuda.device_count():
         raise UserError(f"{ranks.LOCAL_COUNT} processes for {torch.cuda.device_count()} GPUs: one for each, or --device cpu")
     return torch.device("cuda", ranks.LOCAL)

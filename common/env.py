@@ -2,7 +2,6 @@
 
 Importing this module registers both as "Push-v0"; gymnasium.make("common.env:Push-v0") imports it by itself.
 """
-from dataclasses import replace
 from operator import attrgetter
 
 import gymnasium as gym
@@ -24,8 +23,8 @@ class PushVectorEnv(gym.vector.VectorEnv):
     Infos: `state` (N, 7) true states in SI units and `success` (N,) of this step. Where an episode ended, `_final_obs` (N,)
     is set, `final_obs` (N, 8) and `final_state` (N, 7) hold its end, and observation and `state` start the next episode.
 
-    Args: world: task.World, what is drawn for an episode; starts: other ones than the world's; sub_steps: physics steps a
-    control step; threads: as in simulator.Worlds; they change no bit.
+    Args: world: task.World, what is drawn for an episode; sub_steps: physics steps a control step; threads: as in
+    simulator.Worlds; they change no bit.
 
     Attributes:
         worlds: simulator.Worlds, the physics; its box, pusher, force, dynamics (here the drawn ones) and state are here too.
@@ -35,8 +34,8 @@ class PushVectorEnv(gym.vector.VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
 
-    def __init__(self, num_envs=1, *, world=World(), starts=None, sub_steps=SUB_STEPS, threads=1):
-        self.num_envs, self.world = num_envs, replace(world, starts=starts or world.starts)
+    def __init__(self, num_envs=1, *, world=World(), sub_steps=SUB_STEPS, threads=1):
+        self.num_envs, self.world = num_envs, world
         self.single_observation_space = gym.spaces.Box(-2.0, 2.0, (8,), np.float32)  # positions leave [-1, 1] at the end
         self.single_action_space = gym.spaces.MultiDiscrete([task.BINS, task.BINS])
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
@@ -140,9 +139,9 @@ class PushEnv(gym.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": task.RATE}
 
-    def __init__(self, render_mode=None, world=World(), starts=None):
+    def __init__(self, render_mode=None, world=World()):
         self.render_mode = render_mode
-        self.vector = PushVectorEnv(1, world=world, starts=starts)
+        self.vector = PushVectorEnv(1, world=world)
         self.observation_space = self.vector.single_observation_space
         self.action_space = self.vector.single_action_space
 

@@ -8,7 +8,7 @@ from common.task import C_060, STARTS, Other, World
 
 DURATIONS = {"0": 0.0, "2.5": 2.5, "5": 5.0, "10": 10.0, "full": math.inf}  # s; the paper's own grid is in its plot only
 FILTERED = ("c=0.042", "c=0.078", "support_offset=8mm")  # other worlds in which the particle filter is measured
-SENSING = ("noise", "bias", "gain", "late")  # of a world, what only an observation knows
+SENSED = ("noise", "bias", "force", "late")  # other worlds that only an observation tells from the nets'
 
 
 @dataclass
@@ -43,9 +43,9 @@ def measurements(cfg, policies, world):
         todo[f"contact_switches/{m}"] = Measurement(m, cfg.switch_episodes, switches=True)
     todo |= {f"other_worlds/{row}/{m}": Measurement(m, cfg.other_episodes, world=other)
              for row, other in (other_worlds(world).items() if cfg.other_episodes else ()) for m in methods
-             if METHODS[m].estimator or METHODS[m].reads == "s" and not of_sensing(other, world)}
+             if METHODS[m].estimator or METHODS[m].reads == "s" and not row.startswith(SENSED)}
     todo |= {f"in_the_loop/{m}": Measurement(m, cfg.episodes, errors=True) for m in methods if METHODS[m].estimator}
-    todo |= {f"filter_loop/{m}/{name}": Measurement(m, 2 * cfg.filter_trajectories, filtered=name == "filter", worlds=1)
+    todo |= {f"filter_loop/{name}/{m}": Measurement(m, 2 * cfg.filter_trajectories, filtered=name == "filter", worlds=1)
              for m in ("est_uncertainty", "priv_on_estimate") if m in methods and cfg.filter_trajectories
              for name in ("ours", "filter")}
     if "est_uncertainty" in methods:
@@ -71,8 +71,3 @@ def other_worlds(world):
         with suppress(ValueError):
             worlds[row] = replace(base, **change)
     return worlds
-
-
-def of_sensing(other, world):
-    """Whether a world of other_worlds differs from `world` in what only an observation knows."""
-    return any(getattr(other, name) != getattr(world, name) for name in SENSING)

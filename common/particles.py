@@ -17,14 +17,12 @@ class Filter:
 
     A particle is a pose, dynamics drawn from `world`, and the sensors' bias, which is integrated in closed form: a Kalman
     filter for each particle (Rao-Blackwellised: Doucet et al. 2000). Takes observations as the estimators do, and tells as
-    they do. Raises ValueError: fewer than LEAST particles.
+    they do.
 
     Args: num: particles; world: task.World, whose ranges and noise are known; seed: of its draws.
     """
 
     def __init__(self, num, world=task.World(), seed=0):
-        if num < LEAST:
-            raise ValueError(f"{num} particles: say {LEAST} or more")
         self.num, self.world, self.rng = num, world, np.random.default_rng(seed)
         self.worlds = Worlds(num, size=world.box)
         # variances of x, y, theta, force x, y; a sensor without noise has next to none
@@ -99,14 +97,12 @@ class Filter:
         return mean, weights @ np.square(q - mean)
 
 
-class Filters:
+class Filters(torch.nn.Module):
     """A Filter a trajectory, in the place of an estimator; in a loop one world at a time. Seeded by torch's draws."""
 
     def __init__(self, num, world=task.World()):
+        super().__init__()
         self.num, self.world = num, world
-
-    def parameters(self):
-        return iter(())
 
     def predict(self, o, hidden=None, passes=None):
         """As networks.Estimator.predict; the hidden state is the filters."""

@@ -130,7 +130,7 @@ def moments(x):
     """Mean and standard deviation of x over all processes."""
     count, total = ranks.totals(x.numel(), x.double().sum())
     squares, = ranks.totals((x.double() - total / count).square().sum())
-    return total / count, math.sqrt(squares / (count - 1))
+    return total / count, math.sqrt(squares / max(count - 1, 1))
 
 
 def sequences(batch, gamma, lam):

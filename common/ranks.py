@@ -23,7 +23,7 @@ def begin(device):
         if device.type == "cuda":
             torch.cuda.set_device(device)
         dist.init_process_group("gloo" if device.type == "cpu" else "cpu:gloo,cuda:nccl", timeout=PATIENCE)
-        groups[:] = [dist.new_group() for _ in groups]
+        groups[:] = [dist.new_group(timeout=PATIENCE) for _ in groups]
 
 
 def end():
@@ -107,4 +107,4 @@ def let_the_cause_speak(failure):
     if COUNT > 1:
         echo = isinstance(failure, (dist.DistError, RuntimeError)) and any(
             word in str(failure).lower() for word in ("gloo", "nccl", "connection", "store"))
-        time.sleep(5 * echo + 2 * (RANK > 0))
+        time.sleep(5 * echo + 10 * (RANK > 0))

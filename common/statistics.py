@@ -7,6 +7,7 @@ from common import calibration, task
 
 Z = 1.959964  # 95 % of a normal distribution
 ERRORS = ("trans_mean_l2_mm", "trans_rmse_mm", "rot_mean_abs_deg", "rot_rmse_deg")
+MEANS = ERRORS[::2]
 
 
 def wilson(values):
@@ -43,11 +44,9 @@ def error_table(sums):
 
 def in_the_loop(values):
     """Errors, calibration and what sigma foresees, from the episodes of trajectories.in_the_loop."""
-    parts = {name: np.array([value[name] for value in values]) for name in values[0]}
-    told = errors(parts.pop("all").T) | {"episodes": len(values)}
-    if "course" in parts:
-        told["foreseen"] = calibration.foreseen(parts.pop("course"))
-    return told | {name: calibration.summary(tallies) for name, tallies in parts.items()}
+    sums = {name: np.array([value[name] for value in values]).T for name in values[0]}
+    told = error_table(sums) | {"episodes": len(values)}
+    return told | ({"foreseen": calibration.foreseen(sums["course"].T)} if "course" in sums else {})
 
 
 def spread(values):
@@ -67,7 +66,7 @@ def summarise(done):
         rows[last] = kinds.get(keys[0], wilson)(values)
     vision = results["estimator_ablation"]["vision"]
     for row in results["estimator_ablation"].values():
-        row |= {f"{key}_of_vision": row[key] / vision[key] for key in (ERRORS[0], ERRORS[2]) if vision[key]}
+        row |= {f"{key}_of_vision": row[key] / vision[key] for key in MEANS if vision[key]}
     results["occlusion_loss"] = {method: paired(*(done[f"occlusion_duration/{method}/{name}"] for name in ("0", "full")))
                                  for method in results["occlusion_duration"]}
     reference = done.get("success_rate/est_uncertainty/0")

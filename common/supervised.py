@@ -9,6 +9,12 @@ from common.files import UserError
 from common.progress import bar
 
 
+def check(data, sequences):
+    """Raises UserError: there are more processes than trajectories in a mini-batch."""
+    if (most := min(sequences, len(data[1]) - 1)) < ranks.COUNT:
+        raise UserError(f"{ranks.COUNT} processes share a mini-batch of {most} trajectories: start at most so many")
+
+
 @torch.no_grad()
 def validate(loss, data, limit, sequences, device, world):
     """Mean loss over the valid steps of at most `limit` trajectories: the same noise, occlusions and dropout every time."""
@@ -27,10 +33,8 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
     An epoch is a resume point, a row of metrics, and draws its noise and occlusions afresh. loss(o, s, mask, generator) of
     a batch of trajectories.observe is the mean over the steps it looks at; it may run in two threads at once, draws from the
     generator alone, and needs every parameter. save() is called on rank 0 after each epoch of the lowest validation loss so
-    far. Raises UserError: that is not finite, or there are more processes than trajectories in a mini-batch.
+    far. Raises UserError: that is not finite.
     """
-    if (most := min(sequences, len(data[1]) - 1)) < ranks.COUNT:
-        raise UserError(f"{ranks.COUNT} processes share a mini-batch of {most} trajectories: start at most so many")
     parameters = list(net.parameters())
     device, optimizer = parameters[0].device, torch.optim.Adam(parameters, lr=lr)
     count, first, best, lr_end = len(data[1]) - 1, 0, math.inf, lr if lr_end is None else lr_end

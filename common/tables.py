@@ -2,7 +2,7 @@
 import math
 
 from common import calibration, paper
-from common.statistics import ERRORS, Z
+from common.statistics import ERRORS, MEANS, Z
 
 
 def aligned(header, rows):
@@ -35,11 +35,11 @@ def within(mean, half):
 
 def beside_paper(results):
     """Every number of sec. 5 beside the paper's, with 95 % intervals."""
-    rows = []
-    for kind, e in results["estimator_ablation"].items():
-        for i, (key, unit) in enumerate(zip(ERRORS, ("mean L2, mm", "RMSE, mm", "mean abs., deg", "RMSE, deg"))):
-            published = f"{paper.ERRORS[kind][i]:.2f}" if kind in paper.ERRORS else ""
-            rows.append([f"error of {kind}: {unit}", within(e[key], e["half_95"][key]), published])
+    rows, units = [], ("mean L2, mm", "RMSE, mm", "mean abs., deg", "RMSE, deg")
+    for kind, published in paper.ERRORS.items():
+        if e := results["estimator_ablation"].get(kind):
+            rows += [[f"error of {kind}: {unit}", within(e[key], e["half_95"][key]), f"{number:.2f}"]
+                     for key, unit, number in zip(ERRORS, units, published)]
     rows += [[f"success of {method}", percent(results["success_rate"][method]), f"{published}%"]
              for method, published in paper.SUCCESS.items() if method in results["success_rate"]]
     rows += [[f"loss of {method} from no to full occlusion, points", points(results["occlusion_loss"][method]), f"{published}"]
@@ -52,10 +52,10 @@ def beside_paper(results):
 
 def estimator_ablation(results):
     """Tab. estimator_ablation, with the share of the vision baseline and the errors where the box is seen and occluded."""
-    rows, means = [], (ERRORS[0], ERRORS[2])
+    rows = []
     for kind, e in results["estimator_ablation"].items():
-        share = ", ".join(f"{e[f'{key}_of_vision']:.1%}" for key in means if f"{key}_of_vision" in e)
-        parts = [", ".join(f"{e[part][key]:.2f}" for key in means) if part in e else "" for part in ("seen", "occluded")]
+        share = ", ".join(f"{e[f'{key}_of_vision']:.1%}" for key in MEANS if f"{key}_of_vision" in e)
+        parts = [", ".join(f"{e[part][key]:.2f}" for key in MEANS) if part in e else "" for part in ("seen", "occluded")]
         rows.append([kind, *(f"{e[key]:.2f}" for key in ERRORS), share, *parts])
     title = "Errors of the estimators on the test set (tab. estimator_ablation); in pairs: mean L2 (mm), mean abs. (deg)"
     header = ["estimator", "L2 (mm)", "RMSE (mm)", "abs. (deg)", "RMSE (deg)", "of vision", "seen", "occluded"]
@@ -64,7 +64,7 @@ def estimator_ablation(results):
 
 def in_the_loop(results):
     """Errors of the estimates while each policy plays."""
-    rows = [[method, *(within(e[key], e["half_95"][key]) for key in (ERRORS[0], ERRORS[2]))]
+    rows = [[method, *(within(e[key], e["half_95"][key]) for key in MEANS)]
             for method, e in results.get("in_the_loop", {}).items()]
     return titled("Errors of the estimate in the loop, with 95 % intervals", ["policy", "mean L2 (mm)", "mean abs. (deg)"], rows)
 
@@ -96,15 +96,10 @@ def filtered(results):
     """The particle filter beside the estimators, on the same trajectories."""
     sets = results.get("filter", {})
     kinds = [*next(iter(sets.values()), {})]
-    rows = [[name, *(", ".join(f"{rates[kind][key]:.2f}" for key in (ERRORS[0], ERRORS[2])) for kind in kinds)]
+    rows = [[name, *(", ".join(within(e[key], e["half_95"][key]) for key in MEANS) for e in rates.values())]
             for name, rates in sets.items()]
-    return titled("The particle filter beside the estimators: mean L2 (mm), mean abs. (deg)", ["trajectories", *kinds], rows)
-
-
-def filter_loop(results):
-    """Success with the particle filter in the loop instead of ours, on the same episodes."""
-    rows = [[method, *map(percent, rates.values())] for method, rates in results.get("filter_loop", {}).items()]
-    return titled("Success with the particle filter in the loop, on the same episodes", ["policy", "ours", "filter"], rows)
+    title = "The particle filter beside the estimators: mean L2 (mm), mean abs. (deg), with 95 % intervals"
+    return titled(title, ["trajectories", *kinds], rows)
 
 
 def success_rate(results):
@@ -145,14 +140,15 @@ def other_worlds(results):
 
 
 def further(results):
-    """Other starts, and sampled actions."""
+    """Other starts, the particle filter in the loop and ours on the same episodes, and sampled actions."""
     sections = {f"starts {name}": rates for name, rates in results.get("starts", {}).items()}
+    sections |= {f"{name} in the loop": rates for name, rates in results.get("filter_loop", {}).items()}
     sections["actions sampled"] = results.get("sampled_actions", {})
     return "\n".join(f"- {method}, {what}: success {percent(rate)}" for what, rates in sections.items()
                      for method, rate in rates.items())
 
 
-SECTIONS = (beside_paper, estimator_ablation, success_rate, in_the_loop, calibrated, foreseen, filtered, filter_loop,
+SECTIONS = (beside_paper, estimator_ablation, success_rate, in_the_loop, calibrated, foreseen, filtered,
             occlusion_duration, other_worlds, further)
 
 

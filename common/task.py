@@ -74,12 +74,14 @@ class World:
         diagonal = float(np.hypot(*self.box[:2]))
         if min(self.box) <= 0 or diagonal >= min(WORKSPACE):
             raise ValueError(f"--box {self.box}: of its diagonal, {diagonal:.2f} m, the workspace leaves no room to start")
+        largest = {"restitution": 1.0, "support": 1.0, "support_offset": min(self.box[:2]) / 2}
         for name in (*DRAWN, "support", "support_offset"):
-            low, high = getattr(self, name)
-            if not 0 <= low <= high < np.inf or name == "mass" and not low:
-                raise ValueError(f"--{name.replace('_', '-')} {low} {high}: a range, the least first")
-        if not self.max_force > 0:
-            raise ValueError(f"--max-force {self.max_force}: above 0")
+            (low, high), most = getattr(self, name), largest.get(name, np.finfo(float).max)
+            if not 0 <= low <= high <= most or name == "mass" and not low:
+                upper = f", up to {most:g}" if name in largest else ""
+                raise ValueError(f"--{name.replace('_', '-')} {low} {high}: a range, the least first{upper}")
+        if not self.max_force > 0 or not self.occlusion_start <= 1:
+            raise ValueError(f"--max-force {self.max_force} --occlusion-start {self.occlusion_start}: above 0, and at most 1")
 
     @classmethod
     def of(cls, settings):

@@ -75,7 +75,7 @@ def pose_errors(q_hat, q, occluded, mask):
     {"all" | "seen" | "occluded": (5, B) sums of (1, |d_xy|, |d_xy|^2, |d_theta|, d_theta^2) in m and rad}.
     """
     error, occluded, mask = calibration.pose_error(q_hat, q), occluded > 0, mask > 0
-    l2, angle = np.hypot(*np.moveaxis(error[..., :2], -1, 0)), np.abs(error[..., 2])
+    l2, angle = np.linalg.norm(error[..., :2], axis=-1), np.abs(error[..., 2])
     terms = np.stack([np.ones_like(l2), l2, l2**2, angle, angle**2])
     steps = {"all": mask, "seen": mask & ~occluded, "occluded": mask & occluded}
     return {name: (terms * chosen).sum(1) for name, chosen in steps.items()}
@@ -83,7 +83,6 @@ def pose_errors(q_hat, q, occluded, mask):
 
 def compared(q_hat, variance, q, occluded, mask, scale=None):
     """`pose_errors`, and of estimates that tell a variance (T, B, 4) calibration's tallies (., B), also of it scaled."""
-    q_hat, q = q_hat.astype(float), q.astype(float)
     told = pose_errors(q_hat, q, occluded, mask)
     if variance is not None and variance.any():
         told |= {name: calibration.tally(q_hat, variance * np.square(factors), q, occluded, mask).T
@@ -93,16 +92,15 @@ def compared(q_hat, variance, q, occluded, mask, scale=None):
 
 def in_the_loop(rows, length, success, scale=None):
     """Of the beliefs while a policy played, from film.Recorded's rows, lengths and success (N,) of the episodes: for each
-    episode `compared`'s parts, "all" (5,) of pose_errors, and calibration's "course".
+    episode `compared`'s parts, and calibration's "course".
     """
-    state, o, belief = (np.stack([row[name] for row in rows[:length.max()]]) for name in ("state", "o", "belief"))
+    state, o, belief = (np.stack([row[name] for row in rows[:length.max()]]).astype(float) for name in ("state", "o", "belief"))
     q = symmetry.mirror(task.scale(state), symmetry.signs(o[0]))[..., :4]
     mask, variance = (np.arange(len(q))[:, None] < length).astype(np.float32), np.square(belief[..., 8:])
     told = compared(belief[..., :4], variance, q, o[..., 8], mask, scale)
-    parts = {name: told[name].T.tolist() for name in ("all", *calibration.TALLIES) if name in told}
-    if "calibration" in parts:
-        parts["course"] = calibration.course(variance, length, success).tolist()
-    return [dict(zip(parts, values)) for values in zip(*parts.values())]
+    if "calibration" in told:
+        told["course"] = calibration.course(variance, length, success).T
+    return [dict(zip(told, values)) for values in zip(*(sums.T.tolist() for sums in told.values()))]
 
 
 @torch.no_grad()

@@ -3,9 +3,9 @@
     python tests/second_simulator.py [pretrained|quick|laptop|paper] [--weights DIR] [--episodes n] [--seed k]
 
 MuJoCo is not in requirements.txt: pip install mujoco. Starts and dynamics are drawn as in the nets' world, but that MuJoCo
-knows neither static friction nor restitution; noise, occlusions, estimator and policy are the project's. Prints first how
-fast the finger slips in a push in which theory says that it sticks, then success and the errors in the loop, and last the c
-at which the project's world, stepped from MuJoCo's states in contact, turns the box as far, and how far off it is then.
+knows no static friction, restitution or eccentric support; noise, occlusions, estimator and policy are the project's. Prints
+first how fast the finger slips in a push in which theory says that it sticks, then success and the errors in the loop, and
+last the c at which the project's world, stepped from MuJoCo's states in contact, turns the box as far, and how far off it is.
 """
 import copy
 import sys
@@ -157,7 +157,8 @@ def compare(rows, length, dynamics, world):
 
     def stepped(c):
         given = {name: value[i] for name, value in dynamics.items()}
-        given |= {"limit_surface_c": np.full(len(i), c), "mu_static": given["mu_dynamic"], "restitution": np.zeros(len(i))}
+        given |= {"limit_surface_c": np.full(len(i), c), "mu_static": given["mu_dynamic"]}
+        given |= dict.fromkeys(("restitution", "support_x", "support_y"), np.zeros(len(i)))
         worlds.place(np.arange(len(i)), start[:, :3], start[:, 3:5], given)
         for k in range(WINDOW):
             worlds.step(task.RATE * (states[t + k + 1, i, 3:5] - states[t + k, i, 3:5]))

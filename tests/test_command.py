@@ -115,7 +115,8 @@ def test_device(monkeypatch):
     with pytest.raises(UserError, match="--device cuda"):
         command.device_of(Config(device="cuda"))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert command.device_of(Config()).type == "cuda"
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    assert command.device_of(Config()) == torch.device("cuda", 0)  # with its number, which set_device needs
     assert command.device_of(Config(device="cpu")).type == "cpu"
 
 

@@ -53,7 +53,7 @@ def start_shares(env, starts):
 
 @pytest.mark.parametrize("starts", ["box", "centre", "inner"])
 def test_starts_fill_their_region(starts):
-    env = PushVectorEnv(4000, starts=starts)
+    env = PushVectorEnv(4000, world=World(starts))
     env.reset(seed=8)
     shares = start_shares(env, starts)
     assert (np.abs(shares) <= 1 + 1e-9).all() and (np.abs(env.pusher) <= [0.30, 0.15]).all()
@@ -71,7 +71,7 @@ def test_a_box_starts_whole_within_the_workspace():
     corners = np.abs([draw.corners(box) for box in env.box])
     assert (corners <= task.HALF + 1e-9).all() and (corners.max((0, 1)) > task.HALF - 0.002).all()
     for starts in ("centre", "inner"):
-        env = PushVectorEnv(2000, starts=starts)
+        env = PushVectorEnv(2000, world=World(starts))
         env.reset(seed=8)
         outside = (np.abs([draw.corners(box) for box in env.box]) > task.HALF).any((1, 2))
         assert outside.any() == (starts == "centre")
@@ -101,7 +101,9 @@ def test_observations_clip_at_the_worlds_force():
 @pytest.mark.parametrize("changes, words", [
     ({"box": (0.25, 0.2, 0.07)}, "0.32 m, the workspace leaves no room to start"), ({"box": (0.1, 0.0, 0.07)}, "no room"),
     ({"mass": (2.0, 1.0)}, "--mass 2.0 1.0"), ({"mass": (0.0, 1.0)}, "--mass"), ({"support": (0.5, 0.2)}, "--support"),
-    ({"mu_dynamic": (-0.1, 0.2)}, "--mu-dynamic"), ({"support_offset": (0.1, 0.0)}, "--support-offset")])
+    ({"mu_dynamic": (-0.1, 0.2)}, "--mu-dynamic"), ({"support_offset": (0.1, 0.0)}, "--support-offset"),
+    ({"support": (0.0, 2.0)}, "up to 1"), ({"support_offset": (0.0, 0.06)}, "up to 0.05"),
+    ({"restitution": (0.0, 2.0)}, "up to 1"), ({"occlusion_start": 2.0}, "at most 1")])
 def test_no_such_world(changes, words):
     with pytest.raises(ValueError, match=words):
         World(**changes)

@@ -1,13 +1,15 @@
 """The numbered scripts, in the smoke preset: what goes wrong, told in one line."""
 import importlib
 import json
+import os
+import sys
 
 import pytest
 import torch
 from conftest import SCRIPTS, is_mistake, start
 from test_stages import OUTPUTS
 
-from common import command, files
+from common import command, files, ranks
 
 
 @pytest.mark.parametrize("script, needed", [("02_collect", "01_train_privileged"), ("03_train_estimator", "02_collect"),
@@ -65,6 +67,18 @@ def test_a_training_that_diverged_does_not_finish(copy, call, script, method, ar
 def test_a_mistake_costs_no_run(study, call, script, args, words, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert is_mistake(*call(study, script, "--force", *args), words)
+    assert all((study / "smoke" / folder / name).exists() for folder, names in OUTPUTS.items() for name in names)
+
+
+@pytest.mark.parametrize("script, args", [
+    ("01_train_privileged", ()), ("03_train_estimator", ("--method", "mse")), ("04_train_policy", ("--method", "est")),
+    ("04_train_policy", ("--method", "behavior_cloning"))])
+def test_too_many_processes_cost_no_run(study, call, script, args, monkeypatch):
+    monkeypatch.setattr(ranks, "COUNT", 17)
+    monkeypatch.setattr(ranks, "begin", lambda device: None)
+    monkeypatch.setattr(ranks, "let_the_cause_speak", lambda failure: None)
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    assert is_mistake(*call(study, script, "--force", *args), "17 processes share", "16", "at most")
     assert all((study / "smoke" / folder / name).exists() for folder, names in OUTPUTS.items() for name in names)
 
 

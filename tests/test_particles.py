@@ -121,8 +121,3 @@ def test_each_trajectory_has_draws_of_its_own():
     torch.manual_seed(0)
     again = particles.Filters(50).predict(o)[0]
     assert not mean[:, 0].equal(mean[:, 1]) and mean.equal(again)  # conftest has seeded torch with 0
-
-
-def test_too_few_particles():
-    with pytest.raises(ValueError, match="9 particles: say 10 or more"):
-        particles.Filter(9)
