@@ -191,7 +191,7 @@ def main(cfg):
     paths, nets = estimators | policies, {(kind, i): path for kind in estimators for i, path in enumerate(estimators[kind])}
     run = runs.Run(cfg, "05_evaluate", nets | policies | test_paths, grows=True)
     if left_out:
-        print(f"left out, as not trained to the end: {'; '.join(left_out)}")
+        print(f"left out, as not trained to the end, or without their nets: {'; '.join(left_out)}")
     players, todo = Players(cfg, paths, device, run.world), measurements(cfg, policies, run.world)
     def sha(*paths):
         return [*runs.hashes_of(cfg, paths).values()]

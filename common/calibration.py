@@ -99,7 +99,8 @@ def summary(tallies):
 
 
 def course(variance, length, success):
-    """Of each episode (N, 2 + 20): length, whether it left the workspace (time-outs: nan), sigma in mm at each second.
+    """Of each episode (N, 2 + 20): length, whether it left the workspace (nan where the time was out, or all used), sigma in mm
+    at each second.
 
     From scaled variances (T, N, 4), lengths (N,) and success (N,).
     """

@@ -13,7 +13,7 @@ SENSED = ("noise", "bias", "force", "late")  # other worlds that only an observa
 
 @dataclass
 class Measurement:
-    """So many episodes of the fixed list, played by one policy in one kind of world."""
+    """So many episodes of a fixed list, that of so many worlds at once, played by one policy in one kind of world."""
 
     method: str
     episodes: int

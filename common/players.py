@@ -26,7 +26,7 @@ class Players:
         return stacks.load_estimator(kind, self.paths[kind], self.device) if kind else None
 
     def chunk(self, m, number):
-        """Success (N,), length (N,) and film.Recorded of a chunk: starts, dynamics, noise, occlusions as for all."""
+        """Success (N,), length (N,) and film.Recorded of a chunk: starts, dynamics, noise, occlusions as for all policies."""
         seed = LIST * (1 + self.cfg.seed) + number
         torch.manual_seed(seed)
         method = METHODS[m.method]

@@ -54,7 +54,9 @@ def spread(values):
 
 
 def summarise(done):
-    """results.json from {section/key/...: one number an episode, or an error table}, as 05 measures them."""
+    """results.json from {section/key/...: a number or trajectories.in_the_loop of each episode, or an error table}, as 05
+    measures them.
+    """
     results = {"occlusion_duration": {}, "other_worlds": {}}
     kinds = {"estimator_ablation": dict, "filter": dict, "success_rate": list, "in_the_loop": in_the_loop,
              "contact_switches": lambda v: spread(v) | {"episodes": len(v)}}

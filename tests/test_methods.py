@@ -46,7 +46,7 @@ def test_a_method_is_one_entry_and_05_measures_only_what_is_new(study, extended,
     assert json.loads((own / "04_train_policy/mine/seed0/config.json").read_text())["inputs"].keys() >= {
         "03_train_estimator/likelihood/seed0/estimator.safetensors"}
     stdout = extended("05_evaluate")
-    assert "left out, as not trained to the end: est; est_mse; behavior_cloning\n" in stdout
+    assert "left out, as not trained to the end, or without their nets: est; est_mse; behavior_cloning\n" in stdout
     table = json.loads(results.read_text())
     assert table["success_rate"].keys() == {"est_uncertainty", "end_to_end", "mine", "priv_on_estimate", "priv_on_state"}
     assert table["occlusion_duration"].keys() == table["success_rate"].keys() - {"priv_on_state"}
@@ -57,7 +57,7 @@ def test_a_method_is_one_entry_and_05_measures_only_what_is_new(study, extended,
     shutil.copytree(own / "04_train_policy/mine/seed0", own / "04_train_policy/mine/seed7")
     shutil.copytree(study / "smoke/04_train_policy/est", own / "04_train_policy/est")
     before = json.loads((results.parent / "measurements.json").read_text())
-    assert "left out, as not trained to the end: est_mse; behavior_cloning\n" in extended("05_evaluate")
+    assert "or without their nets: est_mse; behavior_cloning\n" in extended("05_evaluate")
     after = json.loads((results.parent / "measurements.json").read_text())
     assert {key.split()[0] for key in after.keys() - before.keys()} == {"success_rate/mine/7", "success_rate/est/0", *(
         f"occlusion_duration/est/{seconds}" for seconds in ("0", "2.5", "5", "10", "full"))}
@@ -68,7 +68,7 @@ def test_05_measures_pi_priv_alone_where_nothing_else_is_trained(study, extended
     for stage in ("01_train_privileged", "02_collect"):
         shutil.copytree(study / "smoke" / stage, tmp_path / "runs/smoke" / stage)
     stdout = extended("05_evaluate")
-    assert "left out, as not trained to the end: estimator mse; estimator likelihood; estimator ours; est_uncertainty; est" in stdout
+    assert "their nets: estimator mse; estimator likelihood; estimator ours; est_uncertainty; est" in stdout
     assert json.loads((tmp_path / "runs/smoke/05_evaluate/seed0/results.json").read_text())["success_rate"].keys() == {
         "priv_on_state"}
 
