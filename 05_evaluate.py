@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from common import command, film, particles, plots, ranks, runs, stacks, statistics, tables, task, trajectories
+from common import calibration, command, film, particles, plots, ranks, runs, stacks, statistics, tables, task, trajectories
 from common.files import UserError, load_json, save_json, write_atomic
 from common.measurements import FILTERED, Measurement, measurements
 from common.players import LIST, Players
@@ -65,12 +65,14 @@ def trained(cfg):
             if kind not in TRAINED:  # seeds of two studies are no ensemble
                 runs.check_lineage(cfg, paths[0].parent, runs.hashes_of(cfg, [pi_priv, *paths]))
             estimators[kind] = paths
-        except (runs.Missing, runs.Mixed):
+        except runs.Missing:
             if kind in TRAINED:
                 left_out.append(f"estimator {kind}")
+        except runs.Mixed:
+            left_out.append(f"estimator {kind} (of other nets than these)")
     for name, method in METHODS.items():
         stage, folder = ("01_train_privileged", None) if method.training == "pi_priv" else ("04_train_policy", name)
-        for k in sorted({*[0] * method.published, *runs.seeds(cfg.roots, stage, folder)}):
+        for k in sorted({*runs.seeds(cfg.roots, stage, folder)} | ({0} if method.published else set())):
             label = f"{name}, seed {k}" if k else name
             try:
                 path = runs.find(cfg, stage, "policy.safetensors", folder, k)
@@ -201,7 +203,7 @@ def main(cfg):
     sources |= {f"filter/{row}/{kind}": sha(*test_paths.values(), pi_priv, *estimators.get(kind, ()))
                 for row in ("test", "drifting", *FILTERED) if cfg.filter_trajectories for kind in ("vision", *tested, "filter")}
     sources |= {name: sha(policies[m.method, m.seed], *estimators.get(METHODS[m.method].estimator, ()))
-                for name, m in todo.items()}
+                + [calibration.PARTS] * m.errors for name, m in todo.items()}
     keys = {name: f"{name} {hashlib.sha256(repr(files).encode()).hexdigest()[:16]}" for name, files in sources.items()}
     kept = ranks.lead(load_json)(run.dir / "measurements.json", "delete it, and the same command measures anew") or {}
     if run.finished and set(keys.values()) <= kept.keys() and ranks.lead((run.dir / "results.json").exists)():

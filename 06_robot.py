@@ -63,14 +63,12 @@ def connect(cfg):
     module, _, name = cfg.arm.partition(":")
     try:  # whatever goes wrong in somebody's class
         make = hardware.SimulatedArm if cfg.arm == "simulated" else getattr(importlib.import_module(module), name)
-        arm = make(cfg)
+        arm = safety.Guarded(make(cfg))
     except Exception as error:
         raise UserError(f"--arm {cfg.arm}: {type(error).__name__}: {error}; say simulated, or module:Class") from None
-    if not isinstance(arm, hardware.Arm):
-        raise UserError(f"--arm {cfg.arm}: it has not all that common/robot/hardware.py's Arm has")
-    if cfg.camera and isinstance(arm, hardware.SimulatedArm):
+    if cfg.camera and arm.simulated:
         raise UserError(f"--camera {cfg.camera}: the simulated arm has its own")
-    return safety.Guarded(arm)
+    return arm
 
 
 def prepare(arm, cfg, scenario, k, world=World()):
@@ -80,10 +78,13 @@ def prepare(arm, cfg, scenario, k, world=World()):
     start = rng.uniform(1, 5)
     hand = {"natural": (np.inf, np.inf), "hand_5s": (start, start + 5), "hand_full": (start, np.inf)}[scenario]
     if not arm.simulated:
+        arm.waiting = True
         try:
             input(f"{scenario}, run {k + 1}: place the box, bring the pusher to where the camera sees it, and press Enter ")
         except EOFError:
             raise UserError("a real arm needs someone at the terminal, to place the box") from None
+        finally:
+            arm.waiting = False
         return hand
     env = PushVectorEnv(1, world=world)
     while True:  # a start of the study from which the camera sees the box
@@ -170,7 +171,7 @@ def perform(arm, f, pi, run, logs, scenario, k, screen):
         with controller.Controller(arm, run.cfg.realtime or not arm.simulated, run.cfg.think) as drive:
             ended = control(drive, f, pi, run.cfg, hand, rows, screen)
     except safety.Stop as reason:
-        if arm.simulated and isinstance(reason.__context__, KeyboardInterrupt):
+        if arm.simulated and (isinstance(reason.__context__, KeyboardInterrupt) or page.BUTTON in arm.stopped):
             raise  # not the policy's failure: the same command plays the run again
         ended, stop = "stopped", reason
     log = runlog.log_of(rows, ended, bool(arm.simulated and arm.simulated.joined))

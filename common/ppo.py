@@ -186,6 +186,10 @@ def value_loss(critic, seq, cols, hp):
     return hp.value_coef * loss, loss.detach()[None]
 
 
+def optimizer(net, lr):
+    return torch.optim.Adam(net.parameters(), lr=lr, eps=1e-5, fused=True)
+
+
 def _descend(net, optimizer, loss, group, seq, batches, hp):
     """One step of Adam a mini-batch; what else the loss returned, (mini-batches, .), over all processes, as the gradient is.
 
@@ -223,12 +227,13 @@ def update(actor, critic, optimizers, seq, hp):
     """
     count = int(seq["mask"][0].sum())
     counts, steps = zip(*ranks.gather((count, seq["mask"].sum().item())))
-    per_epoch = min(max(1, round(sum(steps) / hp.minibatch)), *(math.ceil(n / speed.WIDTH) for n in counts))
+    per_epoch = min(*counts, max(1, round(sum(steps) / hp.minibatch)))
+    block = speed.WIDTH if count > speed.WIDTH * (per_epoch - 1) else 1
 
     def deal():
         """All sequences in random order, in mini-batches of whole blocks, filled up with the empty one after the last."""
-        order = F.pad(torch.randperm(count), (0, -count % speed.WIDTH), value=count).to(seq["mask"].device)
-        return [blocks.flatten() for blocks in order.view(-1, speed.WIDTH).tensor_split(per_epoch)]
+        order = F.pad(torch.randperm(count), (0, -count % block), value=count).to(seq["mask"].device)
+        return [blocks.flatten() for blocks in order.view(-1, block).tensor_split(per_epoch)]
 
     batches = [cols for _ in range(hp.epochs) for cols in deal()]
     both = map if seq["mask"].is_cuda and ranks.COUNT > 1 else speed.side_by_side  # nccl knows one order of collectives

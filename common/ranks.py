@@ -107,4 +107,4 @@ def let_the_cause_speak(failure):
     if COUNT > 1:
         echo = isinstance(failure, (dist.DistError, RuntimeError)) and any(
             word in str(failure).lower() for word in ("gloo", "nccl", "connection", "store"))
-        time.sleep(5 * echo + 10 * (RANK > 0))
+        time.sleep(5 * echo + 10 * (RANK > 0))  # s: so far may the start of one process be behind another's

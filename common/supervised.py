@@ -36,7 +36,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
     far. Raises UserError: that is not finite.
     """
     parameters = list(net.parameters())
-    device, optimizer = parameters[0].device, torch.optim.Adam(parameters, lr=lr)
+    device, optimizer = parameters[0].device, torch.optim.Adam(parameters, lr=lr, fused=True)
     count, first, best, lr_end = len(data[1]) - 1, 0, math.inf, lr if lr_end is None else lr_end
     if state := run.load_resume():
         net.load_state_dict(state["net"]), optimizer.load_state_dict(state["optimizer"])

@@ -80,7 +80,7 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
     Raises UserError: the KL or the value loss of an update is not finite.
     """
     worlds, running = env.unwrapped, np.zeros((2, env.num_envs))
-    optimizers = [torch.optim.Adam(net.parameters(), lr=hp.lr, eps=1e-5, fused=True) for net in (actor, critic)]
+    optimizers = [ppo.optimizer(net, hp.lr) for net in (actor, critic)]
     kl_end = hp.kl_target if hp.kl_target_end is None else hp.kl_target_end
     first, curriculum, stats, success = 0, (hp.tolerance, 0, 0), dict.fromkeys(STATS, math.nan), math.nan
     if state := run.load_resume():

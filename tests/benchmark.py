@@ -74,7 +74,7 @@ def learn(what, preset, most, **changes):
     hp = stage.Config(**stage.PRESETS[preset] | changes)
     env = stacks.make(stacks.METHODS["priv_on_state"], training.shares(hp)[0])
     actor, critic = networks.policy(8, hp.sizes), networks.value(8, hp.sizes)
-    optimizers = [torch.optim.Adam(net.parameters(), lr=1e-4, eps=1e-5) for net in (actor, critic)]
+    optimizers = [ppo.optimizer(net, 1e-4) for net in (actor, critic)]
     carry = training.begin(env, actor, critic, 0, 0)
     steps = hp.num_envs * hp.rollout_steps
     line(f"rollout, {what}, {HOW}", rate(lambda: ppo.rollout(env, actor, critic, carry, hp.rollout_steps), steps, 3))

@@ -38,7 +38,7 @@ class Arm:
     def __init__(self, model, rng, start, rate):
         self.model, self.rng, self.rate, self.joints, self.clock = model, rng, rate, start.copy(), 0.0
         self.stopped, self.must, self.faults, self.unsafe, self.equal, self.stale = False, "", 0, [], 0, 0
-        self.kept, self.since, self.image, self.frozen = (0.0, start.copy()), 0, -1, False
+        self.kept, self.image, self.frozen = (0.0, start.copy()), -1, False
         self.stuck, self.moves, self.alike = False, False, 0
 
     def fault(self, share=1.0):
@@ -78,11 +78,10 @@ class Arm:
             time, q = self.kept
         elif self.stuck or self.fault(0.05):  # the encoders stand still, and their times do not
             self.stuck, q = True, self.kept[1]
-        self.alike = self.alike + 1 if self.moves and q is self.kept[1] else 0
+        self.alike = (self.alike + self.moves) * (q is self.kept[1])
         if self.alike > safety.STUCK:
             self.fatal("joints: stuck")
-        self.since = self.since + 1 if time == self.kept[0] else 0
-        if self.since > 8 + ik.QP_RATE * safety.SENSOR_AGE:
+        if time < self.clock - safety.SENSOR_AGE - 1 / ik.QP_RATE:
             self.fatal("joints: stale")
         self.kept = time, q
         return time, q

@@ -56,8 +56,13 @@ def test_a_method_is_one_entry_and_05_measures_only_what_is_new(study, extended,
 
     shutil.copytree(own / "04_train_policy/mine/seed0", own / "04_train_policy/mine/seed7")
     shutil.copytree(study / "smoke/04_train_policy/est", own / "04_train_policy/est")
+    for seed in ("seed1", "seed2"):  # of another study: no ensemble with seed 0
+        likelihood = study / "smoke/03_train_estimator/likelihood/seed0"
+        record = shutil.copytree(likelihood, own / "03_train_estimator/likelihood" / seed) / "config.json"
+        told = json.loads(record.read_text())
+        record.write_text(json.dumps(told | {"inputs": dict.fromkeys(told["inputs"], 64 * "0")}))
     before = json.loads((results.parent / "measurements.json").read_text())
-    assert "or without their nets: est_mse; behavior_cloning\n" in extended("05_evaluate")
+    assert "estimator ensemble (of other nets than these); est_mse; behavior_cloning\n" in extended("05_evaluate")
     after = json.loads((results.parent / "measurements.json").read_text())
     assert {key.split()[0] for key in after.keys() - before.keys()} == {"success_rate/mine/7", "success_rate/est/0", *(
         f"occlusion_duration/est/{seconds}" for seconds in ("0", "2.5", "5", "10", "full"))}

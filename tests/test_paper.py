@@ -27,10 +27,10 @@ def test_ppo_updates_the_papers_nets_with_the_papers_estimator():
     module, cfg = paper("04_train_policy", num_envs=8)
     env = stacks.make(stacks.METHODS["est_uncertainty"], cfg.num_envs, networks.Estimator().requires_grad_(False), cfg.passes)
     actor, critic = networks.policy(12, cfg.sizes), networks.value(12, cfg.sizes)
-    optimizers = [torch.optim.Adam(net.parameters(), lr=cfg.lr) for net in (actor, critic)]
+    optimizers = [ppo.optimizer(net, cfg.lr) for net in (actor, critic)]
     carry, before = (env.reset(seed=0)[0], actor.initial(8), critic.initial(8)), actor.encoder.weight.clone()
     batch, _ = ppo.rollout(env, actor, critic, carry, 10)
-    stats = ppo.update(actor, critic, optimizers, ppo.sequences(batch, critic, cfg.gamma, cfg.lam), cfg)
+    stats = ppo.update(actor, critic, optimizers, ppo.sequences(batch, cfg.gamma, cfg.lam), cfg)
     assert batch["obs"].shape == (10, 8, 12) and np.isfinite(list(stats.values())).all()
     assert not actor.encoder.weight.equal(before)
 

@@ -135,7 +135,7 @@ def columns(seq):
 
 
 def optimizers(actor, critic, lr=1e-3):
-    return [torch.optim.Adam(net.parameters(), lr=lr, eps=1e-5) for net in (actor, critic)]
+    return [ppo.optimizer(net, lr) for net in (actor, critic)]
 
 
 # Rollout

@@ -129,7 +129,7 @@ class CtrlC(Faulty):
 
 FAULTS = {JointsNaN: "joint angles", WrenchNaN: "wrench", ImageTimeNaN: "camera", CameraFrozen: "frozen",
           CameraStuck: "camera: the newest is", CameraGone: "no image", WrenchOld: "wrench: the newest is", Forced: "over 40 N",
-          JointAtLimit: "joint 4 is at its limit", Beyond: "beyond the border", JointsOld: "s old",
+          JointAtLimit: "joint 4 is at its limit", Beyond: "beyond the border", JointsOld: "wrench: the newest is -",
           TooFast: "is over its speed", JointsStuck: "the same, while they are told to move",
           Lifted: "above its height", Broken: "BrokenPipeError in test_robot_faults.py", CtrlC: "Ctrl-C"}
 
@@ -185,7 +185,7 @@ def test_a_real_arms_readings_are_of_this_machines_clock(late, good):
     driver.read_wrench = lambda: (read()[0] - late, np.zeros(3))
     if good:
         return guard.begin()
-    with pytest.raises(safety.Stop, match="joint angles: -?0.30 s old"):
+    with pytest.raises(safety.Stop, match="joint angles: the newest is -?0.30 s old"):
         guard.begin()
     assert driver.simulated.stopped
 

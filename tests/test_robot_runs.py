@@ -103,7 +103,7 @@ def test_a_damaged_log_is_named(robot):
 
 @pytest.mark.parametrize("args, words", [(("--latency", "inf"), "finite"), (("--arm", "json:loads"), "TypeError"),
                                          (("--camera", "0"), "has its own"), (("--think", "0.07"), "below 1/15"),
-                                         (("--arm", "builtins:str"), "hardware.py's Arm"),
+                                         (("--arm", "builtins:str"), "no model, read_joints"),
                                          (("--arm", "nothing:Arm"), "module:Class"), (("--arm", "nothing"), "module:Class"),
                                          (("--runs", "0"), "at least 1")])
 def test_mistakes_are_one_line(robot, args, words):

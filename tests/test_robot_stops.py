@@ -29,7 +29,10 @@ class Taped(Driver):
         Taped.last, self.tape = self, []
         drive, stop = self.command, self.stop
         self.command = lambda velocity: (self.tape.append((time.monotonic(), bool(velocity.any()))), drive(velocity))
-        self.stop = lambda: (self.tape.append((time.monotonic(), False)), stop())
+        self.stop = lambda: (self.tape.append((time.monotonic(), False)), stop(), self.stopped())
+
+    def stopped(self):
+        """For a test to see."""
 
 
 @pytest.fixture
@@ -170,11 +173,24 @@ def test_a_signal_stops_the_arm(robot, patient, monkeypatch, number, words, thre
     assert not list(folder.glob("*.npz")) and signal.signal(number, before) is kept  # the run is played again
 
 
+def test_a_second_signal_loses_no_run_of_a_real_arm(robot, nobody, patient, monkeypatch):
+    module, kept = importlib.import_module("06_robot"), lambda *args: None
+    before, think, stop = signal.signal(signal.SIGTERM, kept), module.think, Taped.stopped
+    strike = lambda: os.kill(os.getpid(), signal.SIGTERM)  # noqa: E731
+    monkeypatch.setattr(module, "think", lambda *args: ("time" in args[3] and strike(), think(*args))[1])
+    monkeypatch.setattr(Taped, "stopped", lambda arm: (strike(), stop(arm)))
+    _, stderr, code, folder = robot("--arm", f"{__name__}:Taped", "--scenario", "natural")
+    assert code == 2 and mistakes(stderr) == ["error: arm stopped: SIGTERM"] and stopped_for_good(Taped.last.simulated)
+    assert np.load(folder / "natural_000.npz")["ended"] == "stopped" and signal.signal(signal.SIGTERM, before) is kept
+
+
 def test_a_signal_after_a_stop_ends_what_waits():
     """As at the prompt before a run, when the page's button has stopped the arm."""
     guard, before = safety.Guarded(placed()), signal.signal(signal.SIGTERM, lambda *args: None)
     with pytest.raises(safety.Stop, match="arm stopped: a reason"), guard:
         guard.halt("a reason")
+        os.kill(os.getpid(), signal.SIGTERM)  # changes nothing
+        guard.waiting = True
         os.kill(os.getpid(), signal.SIGTERM)
         pytest.fail("nothing happened")
     signal.signal(signal.SIGTERM, before)

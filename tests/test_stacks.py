@@ -43,7 +43,7 @@ def test_the_policy_plays_and_learns_without_the_true_state(float32):
     assert not batch["done"].any()
     logp = networks.log_softmax(pi(batch["obs"][..., :9])[0])
     torch.testing.assert_close(batch["logp"], logp)
-    seq = ppo.sequences(batch, critic, 0.99, 0.95)
+    seq = ppo.sequences(batch, 0.99, 0.95)
     _, (_, _, kl, clipped) = ppo.policy_loss(pi, seq, torch.arange(5), ppo.Hyperparameters(clip=1e-5))
     assert kl.abs() < 1e-6 and clipped == 0
 

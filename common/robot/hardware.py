@@ -3,7 +3,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -15,7 +15,6 @@ from common.robot.iiwa import IIWA
 from common.robot.model import Model
 
 
-@runtime_checkable
 class Arm(Protocol):
     """The model and the five methods that attach an arm of n joints, a force sensor, a camera; SI units, time.monotonic().
 
@@ -38,7 +37,7 @@ class Arm(Protocol):
         """Joint velocities (n,) in rad/s, held until the next call; for safety zero where that does not come within 0.1 s."""
 
     def stop(self) -> None:
-        """Zero velocity, and no other until the program has ended."""
+        """Zero velocity, and no other until the program has ended; may be called again."""
 
 
 @dataclass

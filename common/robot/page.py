@@ -18,6 +18,7 @@ from common import draw, task
 from common.files import UserError
 from common.robot import views
 
+BUTTON = "the page's stop button"
 HTML = """<!doctype html><meta charset="utf-8"><title>Pushing under occlusion</title>
 <style>body { font: 16px sans-serif; max-width: 960px; margin: 1em auto } img { width: 100%; user-select: none }
 button { font: inherit; padding: .5em 1em } #stop { background: #c33; color: white }</style>
@@ -132,7 +133,7 @@ class Page(ThreadingHTTPServer):
         if sizes.get(word) != len(way) or not (np.abs(way) < 0.1).all():  # nan is not
             raise ValueError
         if word == "stop":
-            self.arm.halt("the page's stop button")
+            self.arm.halt(BUTTON)
         elif self.arm.simulated:
             self.arm.simulated.join(word, way)
 

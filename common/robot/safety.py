@@ -17,6 +17,7 @@ FORCE, PEAK = 40.0, 100.0  # N: of the mean over a control step, and of one read
 SENSOR_AGE, CAMERA_AGE = 0.05, 0.5  # s, of the newest joint angles and wrench, and of the newest image
 EARLY = 0.02  # s that a time may be ahead of that of the joint angles
 FROZEN = 5  # equal images in a row: a live camera's noise never repeats
+PARTS = "model", "read_joints", "read_wrench", "grab", "command", "stop"  # of an arm
 STUCK, MOVES = 15, 0.005  # equal joint angles in a row, while the pusher is told to move, at more than so many m/s
 UNSOLVED = 3  # programs in a row
 JOINT_GAP = np.deg2rad(0.5)  # rad to a joint's limit; the program keeps 2 degrees
@@ -36,14 +37,18 @@ class Guarded:
     """An Arm whose readings are whole, new and within limits, or which has stopped for good and raised Stop.
 
     As a context it is the time in which the arm can move: a signal or an exception inside is a Stop, and it ends with the
-    arm's own stop. `arm` is a hardware.Arm, `simulated` the same if it is a SimulatedArm, else None; `camera` has grab(), and is
-    the arm itself until it is set. Joints, wrench and commands may be one thread's and images another's; `halt` is any thread's.
+    arm's own stop. `arm` is a hardware.Arm, `simulated` the same if it is a SimulatedArm, else None; `camera` has grab(), and
+    is the arm itself until it is set; `waiting` says that the program waits for somebody, outside all runs. Joints, wrench and
+    commands may be one thread's and images another's; `halt` is any thread's. Raises TypeError: the arm lacks a method.
     """
 
     def __init__(self, arm):
+        missing = [name for name in PARTS if not hasattr(arm, name)]
+        if missing:
+            raise TypeError(f"it has no {', '.join(missing)} as hardware.Arm has")
         self.arm, self.camera, self.model, self.stopped = arm, arm, arm.model, ""
         self.simulated = arm if isinstance(arm, hardware.SimulatedArm) else None
-        self._lock, self._halted = threading.Lock(), False
+        self._lock, self.waiting = threading.Lock(), False
 
     def __enter__(self):
         self._handlers = {number: signal.signal(number, self._signalled) for number in SIGNALS
@@ -67,10 +72,10 @@ class Guarded:
     def _signalled(self, number, frame):
         """Only notes the reason, and lets the exception stop the arm: the signal may have come within a call of the driver.
 
-        Between the first reason and the arm's stop another signal changes nothing; after it, it ends what still waits.
+        After the first reason to stop another signal changes nothing, but ends a wait.
         """
         first, self.stopped = not self.stopped, self.stopped or f"arm stopped: {SIGNALS[number]}"
-        if first or self._halted:
+        if first or self.waiting:
             raise KeyboardInterrupt
 
     def begin(self):
@@ -91,7 +96,6 @@ class Guarded:
         finally:
             if mine:
                 self._lock.release()
-            self._halted = True
 
     def stop(self, reason):
         """Stops the arm for good, and raises Stop."""
@@ -116,8 +120,8 @@ class Guarded:
         time, q = self.arm.read_joints()
         whole = np.shape(q) == self.model.limits.shape and np.isfinite(time) and np.isfinite(q).all()
         self.require(whole, f"joint angles: not {len(self.model.limits)} numbers")
-        age = 0 if self.simulated else wall.monotonic() - time
-        self.require(-EARLY <= age <= SENSOR_AGE, f"joint angles: {age:.2f} s old")
+        if not self.simulated:
+            self._check_age("joint angles", time, SENSOR_AGE)
         q = np.array(q, float)
         for i in np.flatnonzero(np.abs(q) > self.model.limits - JOINT_GAP):
             self.stop(f"joint {i + 1} is at its limit, {np.rad2deg(q[i]):.1f} degrees")
@@ -132,7 +136,7 @@ class Guarded:
         within = np.clip(time - last, 1 / ik.QP_RATE, SENSOR_AGE)
         for i in np.flatnonzero(np.abs(q - before) > OVERSPEED * self.model.speeds * within):
             self.stop(f"joint {i + 1} is over its speed, {np.rad2deg(q - before)[i]:.1f} degrees in {within:.3f} s")
-        self._still = self._still + 1 if self._moving and np.array_equal(q, before) else 0
+        self._still = (self._still + self._moving) * np.array_equal(q, before)
         self.require(self._still < STUCK, "joint angles: the same, while they are told to move")
         if not self._joints or time > last:
             self._joints.append((time, q))
@@ -148,7 +152,7 @@ class Guarded:
         return np.array([np.interp(time, times, angle) for angle in zip(*q)])
 
     def _check_age(self, sensor, time, oldest):
-        age = self._joints[-1][0] - time
+        age = (self._joints[-1][0] if self.simulated else wall.monotonic()) - time
         self.require(-EARLY <= age <= oldest, f"{sensor}: the newest is {age:.2f} s old")
 
     def read_wrench(self):
