@@ -71,16 +71,20 @@ def summarise(done):
         row |= {f"{key}_of_vision": row[key] / vision[key] for key in MEANS if vision[key]}
     results["occlusion_loss"] = {method: paired(*(done[f"occlusion_duration/{method}/{name}"] for name in ("0", "full")))
                                  for method in results["occlusion_duration"]}
+
+    def minus_est_uncertainty(name):
+        """{method: `paired`} on the same episodes, of done[name.format(method)]."""
+        reference, others = done.get(name.format("est_uncertainty")), set(results["success_rate"]) - {"est_uncertainty"}
+        return {m: paired(done[name.format(m)], reference) for m in sorted(others) if reference and name.format(m) in done}
+
     for method, by_seed in results["success_rate"].items():
         row = results["success_rate"][method] = wilson(by_seed["0"])
         if len(by_seed) > 1:
             row["seeds"] = spread([np.mean(values) for values in by_seed.values()]) | {"count": len(by_seed)}
-    rows = [("success_rate/{}/0", m, row) for m, row in results["success_rate"].items()]
-    rows += [("occlusion_duration/{}/full", m, rates["full"]) for m, rates in results["occlusion_duration"].items()]
-    rows += [(f"other_worlds/{world}/{{}}", m, row) for world, by in results["other_worlds"].items() for m, row in by.items()]
-    for name, method, row in rows:  # on the same episodes
-        if method != "est_uncertainty" and (reference := done.get(name.format("est_uncertainty"))):
-            row["minus_est_uncertainty"] = paired(done[name.format(method)], reference)
+    for method, difference in minus_est_uncertainty("success_rate/{}/0").items():
+        results["success_rate"][method]["minus_est_uncertainty"] = difference
+    results["minus_est_uncertainty"] = {"full occlusion": minus_est_uncertainty("occlusion_duration/{}/full")} | {
+        world: minus_est_uncertainty(f"other_worlds/{world}/{{}}") for world in results["other_worlds"]}
     return results
 
 

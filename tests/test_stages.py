@@ -163,8 +163,9 @@ def test_results_have_every_number(study):
     assert results["filter"].keys() == {"test", "drifting", *measurements.FILTERED}
     for row in results["filter"].values():
         assert row.keys() == ESTIMATORS | {"vision", "filter"} and all(each["trans_mean_l2_mm"] > 0 for each in row.values())
+    assert results["filter_loop"].keys() == {"ours", "filter"}
     for rates in results["filter_loop"].values():
-        assert rates.keys() == {"ours", "filter"} and {rate["episodes"] for rate in rates.values()} == {2}
+        assert rates.keys() == {"est_uncertainty", "priv_on_estimate"} and {rate["episodes"] for rate in rates.values()} == {2}
     assert results["contact_switches"].keys() == {"priv_on_state", "est_uncertainty"}
     for row in results["contact_switches"].values():
         assert row["mean"] >= 0 and row["std"] >= 0 and row["episodes"] == 16
