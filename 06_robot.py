@@ -1,8 +1,7 @@
 """Stage 06: the policy on an arm with a camera, under natural and human-induced occlusions (sec. 6).
 
-    python 06_robot.py [pretrained|smoke|quick|laptop|paper] [--weights DIR] [--scenario natural|hand_5s|hand_full|all]
-        [--runs n] [--video] [--seed k] [--realtime] [--view [port]] [--think s] [--arm module:Class] [--camera source]
-        [--print-tags]
+    python 06_robot.py [pretrained|smoke|quick|laptop|paper] [--weights DIR] [--scenario natural|hand_5s|hand_full|all] [--runs n]
+        [--video] [--seed k] [--realtime] [--view [port]] [--think s] [--arm module:Class] [--camera source] [--print-tags]
 
 Reads est_uncertainty (04) and the estimator ours (03), of the same preset or in the folder --weights. Writes to
 runs/<preset>/06_robot/seed<k>/: summary.json, robot.png, a log <scenario>_<run>.npz a run and, with --video, two mp4 a run:
@@ -58,8 +57,9 @@ PRESETS = {
 
 def connect(cfg):
     """The arm behind its guard; UserError where there is no such class, or a setting is not within its limits."""
-    if not cfg.think < 1 / task.RATE or np.inf in (getattr(cfg, name) for name in vars(hardware.Gaps())):
-        raise UserError("--think is below 1/15 s, and every gap of the simulated arm finite")
+    for name, most in (*((name, np.inf) for name in vars(hardware.Gaps())), ("think", 1 / task.RATE)):
+        if not getattr(cfg, name) < most:
+            raise UserError(f"--{name} {getattr(cfg, name)}: {'finite' if most == np.inf else 'below 1/15 s'}")
     module, _, name = cfg.arm.partition(":")
     try:  # whatever goes wrong in somebody's class
         make = hardware.SimulatedArm if cfg.arm == "simulated" else getattr(importlib.import_module(module), name)

@@ -71,9 +71,12 @@ TRAINED = {name: kind for name, kind in ESTIMATORS.items() if not kind.nets}  # 
 
 
 def find_estimator(cfg, kind):
-    """Paths of the nets of a kind of estimator. Raises runs.Missing."""
-    return [runs.find(cfg, "03_train_estimator", "estimator.safetensors", name, seed)
-            for name, seed in ESTIMATORS[kind].nets or [(kind, 0)]]
+    """Paths of the nets of a kind of estimator. Raises runs.Missing, and runs.Mixed: seeds of two studies are no ensemble."""
+    paths = [runs.find(cfg, "03_train_estimator", "estimator.safetensors", name, seed)
+             for name, seed in ESTIMATORS[kind].nets or [(kind, 0)]]
+    if len(paths) > 1:
+        runs.check_lineage(cfg, paths[0].parent, runs.hashes_of(cfg, paths))
+    return paths
 
 
 def load_estimator(kind, paths, device="cpu"):

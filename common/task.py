@@ -80,8 +80,10 @@ class World:
             if not 0 <= low <= high <= most or name == "mass" and not low:
                 upper = f", up to {most:g}" if name in largest else ""
                 raise ValueError(f"--{name.replace('_', '-')} {low} {high}: a range, the least first{upper}")
-        if not self.max_force > 0 or not self.occlusion_start <= 1:
-            raise ValueError(f"--max-force {self.max_force} --occlusion-start {self.occlusion_start}: above 0, and at most 1")
+        if not self.max_force > 0:
+            raise ValueError(f"--max-force {self.max_force}: above 0")
+        if not self.occlusion_start <= 1:
+            raise ValueError(f"--occlusion-start {self.occlusion_start}: at most 1")
 
     @classmethod
     def of(cls, settings):

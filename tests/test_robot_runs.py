@@ -69,9 +69,9 @@ def test_a_run_is_logged_and_filmed_and_its_film_shows_the_same(robot):
 def test_what_is_stopped_before_a_run_is_no_failure_of_it(robot, monkeypatch):
     module = importlib.import_module("06_robot")
     prepare = module.prepare
-    monkeypatch.setattr(module, "prepare", lambda arm, *args: (prepare(arm, *args), arm.halt("the page's stop button"))[0])
+    monkeypatch.setattr(module, "prepare", lambda arm, *args: (prepare(arm, *args), arm.halt("a reason"))[0])
     _, stderr, code, folder = robot("--scenario", "natural")
-    assert code == 2 and mistakes(stderr) == ["error: arm stopped: the page's stop button"] and not list(folder.glob("*.npz"))
+    assert code == 2 and mistakes(stderr) == ["error: arm stopped: a reason"] and not list(folder.glob("*.npz"))
 
 
 def test_force_deletes_no_other_scenario(robot):

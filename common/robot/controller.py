@@ -22,7 +22,6 @@ class Controller:
 
     def __init__(self, arm, threaded, think=0.0):
         self.arm, self.late, self.beat = arm, int(np.ceil(think * ik.QP_RATE - 1e-9)), threading.Event()
-        self.still = np.zeros(len(arm.model.limits))
         self.thread = threading.Thread(target=self._follow, daemon=True) if threaded else None
 
     def __enter__(self):
@@ -46,7 +45,7 @@ class Controller:
             self.arm.require(not self.thread.is_alive(), "the control thread hangs")
             self.arm.check()
         else:
-            self.arm.command(self.still)
+            self.arm.command(self.arm.still)
 
     def aim(self, velocity):
         """The target from now on: the pusher's velocity (2,) in m/s."""
@@ -91,7 +90,7 @@ class Controller:
                     steps += 1
                     if steps % ik.STEPS == 0:
                         self.beat.set()
-                self.arm.command(self.still)
+                self.arm.command(self.arm.still)
             except BaseException as error:
                 self.arm.fail(error)
         self.beat.set()

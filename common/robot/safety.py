@@ -17,7 +17,7 @@ FORCE, PEAK = 40.0, 100.0  # N: of the mean over a control step, and of one read
 SENSOR_AGE, CAMERA_AGE = 0.05, 0.5  # s, of the newest joint angles and wrench, and of the newest image
 EARLY = 0.02  # s that a time may be ahead of that of the joint angles
 FROZEN = 5  # equal images in a row: a live camera's noise never repeats
-PARTS = "model", "read_joints", "read_wrench", "grab", "command", "stop"  # of an arm
+PARTS = "model", *(name for name in vars(hardware.Arm) if not name.startswith("_"))  # of an arm
 STUCK, MOVES = 15, 0.005  # equal joint angles in a row, while the pusher is told to move, at more than so many m/s
 UNSOLVED = 3  # programs in a row
 JOINT_GAP = np.deg2rad(0.5)  # rad to a joint's limit; the program keeps 2 degrees
@@ -48,7 +48,7 @@ class Guarded:
             raise TypeError(f"it has no {', '.join(missing)} as hardware.Arm has")
         self.arm, self.camera, self.model, self.stopped = arm, arm, arm.model, ""
         self.simulated = arm if isinstance(arm, hardware.SimulatedArm) else None
-        self._lock, self.waiting = threading.Lock(), False
+        self.still, self._lock, self.waiting = np.zeros(len(arm.model.limits)), threading.Lock(), False
 
     def __enter__(self):
         self._handlers = {number: signal.signal(number, self._signalled) for number in SIGNALS
@@ -186,7 +186,7 @@ class Guarded:
         self.check()
         self._unsolved = self._unsolved + 1 if velocity is None else 0
         self.require(self._unsolved < UNSOLVED, f"{UNSOLVED} programs in a row were not solved")
-        velocity = np.zeros(len(self.model.limits)) if velocity is None else velocity
+        velocity = self.still if velocity is None else velocity
         within = np.shape(velocity) == self.model.limits.shape and (np.abs(velocity) <= 1.001 * self.model.speeds).all()
         self.require(within, "a joint velocity is not within its limit")
         tip = self._jacobian @ velocity
