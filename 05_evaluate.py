@@ -7,7 +7,7 @@ all: those in the folder --weights, which is pretrained/ with the preset pretrai
 runs/<preset>/05_evaluate/seed<k>/: results.json, tables.md, film.mp4, film.gif, and as PNG the figures of sec. 5 and of the
 appendix: success_rate, occlusion_duration, trajectory_with_uncertainty, sim, success_rate_priv, likelihood_loss, mse_loss,
 bc_loss; other_worlds, calibration. What is not trained is left out; after a further training the same command measures what
-is new, and no more (measurements.json). Resumes after the last finished measurement.
+is new, and no more (measurements/, a file each). Resumes after the last finished measurement.
 """
 import hashlib
 import math
@@ -103,20 +103,20 @@ def estimator_errors(cfg, players, test, name):
     return statistics.error_table(sums) if sums else None
 
 
-def measure(run, players, todo, test, keys, kept):
-    """Adds to `kept`, and to its file, what {name: key} has and it has not; False when the time limit stopped it.
+def measure(run, players, todo, test, files, kept):
+    """Adds to `kept` what {name: file} has and it has not, and writes the file; False when the time limit stopped it.
 
     Chunks of episodes, and batches of the test set, are shared out among the processes.
     """
     def keep(name, values):
-        kept[keys[name]] = values
-        save_json(run.dir / "measurements.json", kept, indent=None)
+        kept[name] = values
+        save_json(files[name], values, indent=None)
 
-    for name in [name for name, key in keys.items() if name not in todo and key not in kept]:
+    for name in [name for name in files if name not in todo and name not in kept]:
         ranks.lead(keep)(name, estimator_errors(run.cfg, players, test, name))
         if run.out_of_time():
             return False
-    new = {name: m for name, m in todo.items() if keys[name] not in kept}
+    new = {name: m for name, m in todo.items() if name not in kept}
     chunks = [(name, number) for name, m in new.items() for number in range(math.ceil(m.episodes / m.width(run.cfg)))]
     total, ahead = (sum(m.episodes for m in several.values()) for several in (todo, new))
     progress, values = bar(total, "05_evaluate", unit="episode", initial=total - ahead), defaultdict(list)
@@ -201,17 +201,19 @@ def main(cfg):
                 for row in ("test", "drifting", *FILTERED) if cfg.filter_trajectories for kind in ("vision", *tested, "filter")}
     sources |= {name: sha(policies[m.method, m.seed], *estimators.get(METHODS[m.method].estimator, ()))
                 + [calibration.PARTS] * m.errors for name, m in todo.items()}
-    keys = {name: f"{name} {hashlib.sha256(repr(files).encode()).hexdigest()[:16]}" for name, files in sources.items()}
-    kept = ranks.lead(load_json)(run.dir / "measurements.json", "delete it, and the same command measures anew") or {}
-    if run.finished and set(keys.values()) <= kept.keys() and ranks.lead((run.dir / "results.json").exists)():
+    files = {name: run.dir / "measurements" / name / f"{hashlib.sha256(repr(made_of).encode()).hexdigest()[:16]}.json"
+             for name, made_of in sources.items()}
+    kept = ranks.lead(lambda: {name: load_json(path, "delete it, and the same command measures it anew")
+                               for name, path in files.items() if path.exists()})()
+    if run.finished and files.keys() == kept.keys() and ranks.lead((run.dir / "results.json").exists)():
         report(run)
         return run.skip()
 
-    if not measure(run, players, todo, test, keys, kept):
+    if not measure(run, players, todo, test, files, kept):
         return run.stop()
     if ranks.RANK:
         return
-    done = {name: kept[key] for name, key in keys.items()}
+    done = {name: kept[name] for name in files}  # in their order, whenever they were measured
     results = statistics.summarise(done)
     write_atomic(run.dir / "tables.md", lambda path: path.write_text(tables.every(results)))
     draw(run, players, results, done)

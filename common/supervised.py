@@ -4,7 +4,7 @@ import math
 import numpy as np
 import torch
 
-from common import ranks, speed, trajectories
+from common import muon, ranks, speed, trajectories
 from common.files import UserError
 from common.progress import bar
 
@@ -27,8 +27,8 @@ def validate(loss, data, limit, sequences, device, world):
     return float(np.average(values, weights=steps))
 
 
-def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr_end, grad_norm, validation):
-    """Adam over shuffled trajectories, validated on those of `held_out`; False when the time limit stopped it.
+def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr_end, grad_norm, validation, optimizer="adam"):
+    """Adam (or Muon) over shuffled trajectories, validated on those of `held_out`; False when the time limit stopped it.
 
     An epoch is a resume point, a row of metrics, and draws its noise and occlusions afresh. loss(o, s, mask, generator) of
     a batch of trajectories.observe is the mean over the steps it looks at; it may run in two threads at once, draws from the
@@ -36,11 +36,13 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
     far. Raises UserError: that is not finite.
     """
     parameters = list(net.parameters())
-    device, optimizer = parameters[0].device, torch.optim.Adam(parameters, lr=lr, fused=True)
+    device = parameters[0].device
+    optimizers = muon.optimizers(net, lr) if optimizer == "muon" else [torch.optim.Adam(parameters, lr, fused=True)]
     count, first, best, lr_end = len(data[1]) - 1, 0, math.inf, lr if lr_end is None else lr_end
     if state := run.load_resume():
-        net.load_state_dict(state["net"]), optimizer.load_state_dict(state["optimizer"])
         first, best = state["epoch"], state["best"]
+        for part, saved in zip((net, *optimizers), (state["net"], *state["optimizers"])):
+            part.load_state_dict(saved)
     updates, usual = math.ceil(count / sequences), data[1][-1] / count * sequences  # steps of a mini-batch
     progress = bar(epochs * updates, run.dir.parent.name, initial=first * updates, unit="update")
     for epoch in range(first, epochs):
@@ -55,14 +57,16 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
         losses, weights = [], []
         for k, batch in enumerate(speed.ahead(observed, range(len(parts)))):
             fall = 1 + math.cos(math.pi * ((epoch + k / updates) / epochs))  # along a cosine from 2 to 0
-            optimizer.param_groups[0]["lr"] = lr_end + (lr - lr_end) * fall / 2
+            for group in (group for part in optimizers for group in part.param_groups):
+                group["lr"] = lr_end + (lr - lr_end) * fall / 2
             halves = speed.halves(batch) if ranks.COUNT == 1 else [batch]  # two threads, or a process each
             mean, steps = speed.set_gradient(loss, halves, draws, parameters)
             mean, steps = ranks.average(parameters, mean, steps)
             torch.nn.utils.clip_grad_norm_(parameters, grad_norm)
             for parameter in parameters:  # a step counts the same in each mini-batch
                 parameter.grad *= steps / usual
-            optimizer.step()
+            for part in optimizers:
+                part.step()
             losses.append(mean.item())
             weights.append(float(steps))
             progress.update()
@@ -74,7 +78,8 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
         if validation_loss < best:
             best = validation_loss
             ranks.lead(save)()
-        run.save_resume(dict(epoch=epoch + 1, best=best, net=net.state_dict(), optimizer=optimizer.state_dict()))
+        run.save_resume(dict(epoch=epoch + 1, best=best, net=net.state_dict(),
+                             optimizers=[part.state_dict() for part in optimizers]))
         if run.out_of_time() and epoch + 1 < epochs:
             run.stop()
             return False

@@ -29,7 +29,7 @@ OUTPUTS = {
     "03_train_estimator/likelihood/seed0": ["estimator.safetensors", "likelihood_loss.png", "passes.json"],
     "03_train_estimator/mse/seed0": ["estimator.safetensors", "mse_loss.png", "passes.json"],
     "04_train_policy/behavior_cloning/seed0": ["policy.safetensors", "bc_loss.png"],
-    "05_evaluate/seed0": ["results.json", "measurements.json", "tables.md", "success_rate.png", "occlusion_duration.png",
+    "05_evaluate/seed0": ["results.json", "tables.md", "success_rate.png", "occlusion_duration.png",
                           "sim.png", "trajectory_with_uncertainty.png", "film.mp4", "film.gif", "success_rate_priv.png",
                           "likelihood_loss.png", "mse_loss.png", "bc_loss.png", "calibration.png"],
     "06_robot/seed0": ["summary.json", "robot.png", "natural_000.npz", "hand_5s_000.npz", "hand_full_000.npz"],

@@ -1,0 +1,49 @@
+"""Muon: momentum made orthogonal, for the matrices within a net (Jordan et al. 2024; its rate is Adam's by Liu et al. 2025)."""
+import math
+
+import torch
+
+from common import speed
+
+MOMENTUM = 0.95
+STEPS = 5  # of the Newton-Schulz iteration
+A, B, C = 3.4445, -4.7750, 2.0315  # its polynomial a s + b s^3 + c s^5 brings singular values of 0 < s <= 1 near 1 at once
+GATES = 4  # of an LSTM, whose matrices stand one above the other
+
+
+def orthogonal(x):
+    """Matrices (k, m, n) with their singular values, but the very smallest, brought to between 0.7 and 1.2."""
+    x = x / (x.norm(dim=(1, 2), keepdim=True) + 1e-7)
+    flat = x if x.shape[1] <= x.shape[2] else x.mT
+    for _ in range(STEPS):
+        gram = flat @ flat.mT
+        flat = A * flat + (B * gram + C * gram @ gram) @ flat
+    return flat if x.shape[1] <= x.shape[2] else flat.mT
+
+
+class Muon(torch.optim.Optimizer):
+    """torch.optim.Muon in the parameters' own precision, as CPUs without bfloat16 need it, and a gate of an LSTM at a time.
+
+    Args: params: matrices, in groups with `blocks`, how many stand one above the other in each; lr: of the same size as Adam's.
+    """
+
+    def __init__(self, params, lr):
+        super().__init__(params, dict(lr=lr, blocks=1))
+
+    def step(self):
+        @torch.no_grad()  # in a thread that knows none of ours
+        def descend(p, group):
+            momentum = self.state[p].setdefault("momentum", torch.zeros_like(p)).lerp_(p.grad, 1 - MOMENTUM)
+            blocks = p.grad.lerp(momentum, MOMENTUM).view(group["blocks"], -1, p.shape[1])  # Nesterov's
+            p.sub_(orthogonal(blocks).reshape_as(p), alpha=0.2 * group["lr"] * math.sqrt(max(blocks.shape[1:])))
+
+        pairs = [(p, group) for group in self.param_groups for p in group["params"]]
+        (map if pairs[0][0].is_cuda else speed.side_by_side)(descend, *zip(*pairs))
+
+
+def optimizers(net, lr):
+    """Muon for a net's matrices but the first and the last, and Adam for the rest."""
+    *within, _ = [name for name, p in net.named_parameters() if p.ndim == 2][1:]
+    groups = [{"params": [p for name, p in net.named_parameters() if name in within and ("lstm" in name) == gated],
+               "blocks": GATES if gated else 1} for gated in (True, False)]
+    return [Muon(groups, lr), torch.optim.Adam([p for name, p in net.named_parameters() if name not in within], lr, fused=True)]
