@@ -1,7 +1,9 @@
 """Stage 06: every fault of an arm, a camera or the program that must stop the arm."""
+import gc
 import json
 import threading
 import time
+import weakref
 
 import cv2
 import numpy as np
@@ -10,7 +12,7 @@ from robot_arms import Driver, mistakes, placed, stopped_for_good
 from six_joints import SIX
 
 from common import belief
-from common.robot import hardware, ik, safety
+from common.robot import controller, hardware, ik, safety
 from common.robot.iiwa import IIWA
 
 
@@ -188,6 +190,27 @@ def test_a_real_arms_readings_are_of_this_machines_clock(late, good):
     with pytest.raises(safety.Stop, match="joint angles: the newest is -?0.30 s old"):
         guard.begin()
     assert driver.simulated.stopped
+
+
+def test_a_collection_of_garbage_keeps_no_run_waiting():
+    class Ring:
+        def __init__(self):
+            self.own = self
+
+    heap, ring = [[k] for k in range(10**6)], Ring()
+    gone = weakref.ref(ring)
+    gc.collect()
+    before = time.perf_counter()
+    gc.collect()
+    usual = time.perf_counter() - before
+    for _ in range(2):  # what a run left is collected before the next
+        with controller.Controller(safety.Guarded(placed()), threaded=True) as drive:
+            ring = None
+            before = time.perf_counter()
+            gc.collect()
+            assert time.perf_counter() - before < usual / 3
+            drive.aim(np.zeros(2))
+    assert len(heap) == 10**6 and gone() is None
 
 
 @pytest.mark.parametrize("velocity", [np.zeros(6), np.zeros((7, 1)), np.full(7, np.nan), np.full(7, 9.0), "fast"], ids=str)

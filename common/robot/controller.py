@@ -1,5 +1,6 @@
 """The control loop below the policy: 150 times a second, solve for the last target, command, read joints and wrench."""
 import contextlib
+import gc
 import sys
 import threading
 import time
@@ -26,6 +27,10 @@ class Controller:
 
     def __enter__(self):
         self.running, self.unsolved = True, 0
+        if self.thread:  # looking through all objects would keep every thread from its work for 0.2 s: those of now stay
+            gc.unfreeze()
+            gc.collect()
+            gc.freeze()
         self.arm.begin()
         self.target, self.aimed = np.zeros(2), time.monotonic()
         if self.thread:

@@ -34,7 +34,7 @@ async function follow() {
     state.textContent = JSON.parse(reply.headers.get("State"))
     if (image.size) { URL.revokeObjectURL(view.src); view.src = URL.createObjectURL(image) }
   } catch { state.textContent = "No answer: the program has ended." }
-  setTimeout(follow, 60)
+  setTimeout(follow, 100)
 }
 document.getElementById("stop").onclick = () => post("/stop")
 next.onclick = () => post("/next")

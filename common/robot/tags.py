@@ -52,6 +52,7 @@ def detector():
     """OpenCV's detector of the tags, with settings for their size in the image."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = 13  # one window: a third of the time
+    parameters.minMarkerPerimeterRate = 0.08  # of the image's width: 13 pixels a side; what is smaller is grain, half the time
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     parameters.relativeCornerRefinmentWinSize = 0.7  # small squares; OpenCV's 0.3, a pixel, has ten times the error: 0.5 mm
     return cv2.aruco.ArucoDetector(DICTIONARY, parameters)
