@@ -26,7 +26,8 @@ class Config(command.Reader):
     sizes: tuple[int, int, int] = (1024, 512, 256)  # LSTM and two linear layers (sec. 4)
     dropout: float = 0.2  # probability before every linear layer, of ours (sec. 4)
     sequences: int = 100  # trajectories per mini-batch: 30,000 steps, 300 each (tab. estimator_hyperparameters)
-    epochs: int = 110  # passes over the training set, each with fresh noise and occlusions (tab. estimator_hyperparameters)
+    epochs: int = 110  # passes over the training set (tab. estimator_hyperparameters)
+    fresh: bool = command.setting(False, before=True)  # draw noise and occlusions anew in each, not once a trajectory (sec. 3.2)
     optimizer: Literal["adam", "muon"] = "adam"  # muon: of the matrices within the net, Adam of the rest (Jordan et al. 2024)
     lr: float = 1e-3  # Adam's learning rate (tab. estimator_hyperparameters), and Muon's
     lr_end: float | None = None  # learning rate at the end of a cosine; none: it stays, as the paper's
@@ -35,11 +36,11 @@ class Config(command.Reader):
 
 
 PRESETS = {
-    "smoke": dict(sizes=(16, 16, 16), sequences=16, epochs=2, validation=12),
-    "quick": dict(sizes=(256, 256, 256), dropout=0.05, sequences=32, epochs=8, optimizer="muon", lr=8e-3, lr_end=5e-5,
-                  validation=500),
-    "laptop": dict(sizes=(128, 256, 256), dropout=0.05, sequences=32, epochs=10, optimizer="muon", lr=8e-3, lr_end=5e-5,
-                   validation=1000),
+    "smoke": dict(sizes=(16, 16, 16), sequences=16, epochs=2, fresh=True, validation=12),
+    "quick": dict(sizes=(256, 256, 256), dropout=0.05, sequences=32, epochs=8, fresh=True, optimizer="muon", lr=8e-3,
+                  lr_end=5e-5, validation=500),
+    "laptop": dict(sizes=(128, 256, 256), dropout=0.05, sequences=32, epochs=10, fresh=True, optimizer="muon", lr=8e-3,
+                   lr_end=5e-5, validation=1000),
     "paper": {},
 }
 
@@ -61,7 +62,7 @@ def train(run, cfg, train_set, validation_set, device):
     return supervised.fit(
         run, f, loss, lambda: weights.save(run.dir / "estimator.safetensors", f), train_set, validation_set,
         seed=cfg.seed, sequences=cfg.sequences, epochs=cfg.epochs, lr=cfg.lr, lr_end=cfg.lr_end, grad_norm=cfg.grad_norm,
-        validation=cfg.validation, optimizer=cfg.optimizer)
+        validation=cfg.validation, optimizer=cfg.optimizer, fresh=cfg.fresh)
 
 
 def against_passes(estimator, data, cfg, device, world):

@@ -27,13 +27,14 @@ def validate(loss, data, limit, sequences, device, world):
     return float(np.average(values, weights=steps))
 
 
-def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr_end, grad_norm, validation, optimizer="adam"):
+def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr_end, grad_norm, validation, optimizer="adam",
+        fresh=True):
     """Adam (or Muon) over shuffled trajectories, validated on those of `held_out`; False when the time limit stopped it.
 
-    An epoch is a resume point, a row of metrics, and draws its noise and occlusions afresh. loss(o, s, mask, generator) of
-    a batch of trajectories.observe is the mean over the steps it looks at; it may run in two threads at once, draws from the
-    generator alone, and needs every parameter. save() is called on rank 0 after each epoch of the lowest validation loss so
-    far. Raises UserError: that is not finite.
+    An epoch is a resume point, a row of metrics, and draws its mini-batches, noise and occlusions afresh, or has those of the
+    first in another order. loss(o, s, mask, generator) of a batch of trajectories.observe is the mean over the steps it looks
+    at; it may run in two threads at once, draws from the generator alone, and needs every parameter. save() is called on rank 0
+    after each epoch of the lowest validation loss so far. Raises UserError: that is not finite.
     """
     parameters = list(net.parameters())
     device = parameters[0].device
@@ -46,16 +47,18 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
     updates, usual = math.ceil(count / sequences), data[1][-1] / count * sequences  # steps of a mini-batch
     progress = bar(epochs * updates, run.dir.parent.name, initial=first * updates, unit="update")
     for epoch in range(first, epochs):
-        rng = np.random.default_rng([seed, epoch])
+        drawn = epoch if fresh else 0
+        rng = np.random.default_rng([seed, drawn])
         draws = torch.Generator().manual_seed(int(np.random.default_rng([seed, epoch, ranks.RANK]).integers(2**62)))
         parts = [index[ranks.RANK::ranks.COUNT] for index in trajectories.shuffled(data, sequences, rng)
                  if len(index) >= ranks.COUNT]  # else it is left out, in this epoch
+        order = np.random.default_rng([seed, epoch]).permutation(len(parts)) if drawn < epoch else range(len(parts))
 
         def observed(k):  # 1: to train; other numbers elsewhere
-            return trajectories.observe(data, parts[k], (seed, epoch, k, 1, ranks.RANK), device, run.world)
+            return trajectories.observe(data, parts[k], (seed, drawn, k, 1, ranks.RANK), device, run.world)
 
         losses, weights = [], []
-        for k, batch in enumerate(speed.ahead(observed, range(len(parts)))):
+        for k, batch in enumerate(speed.ahead(observed, order)):
             fall = 1 + math.cos(math.pi * ((epoch + k / updates) / epochs))  # along a cosine from 2 to 0
             for group in (group for part in optimizers for group in part.param_groups):
                 group["lr"] = lr_end + (lr - lr_end) * fall / 2

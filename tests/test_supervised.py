@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from common import supervised
+from common import supervised, trajectories
 from common.task import World
+
+
+def run_in(folder):
+    return SimpleNamespace(dir=folder, load_resume=lambda: None, save_resume=lambda state: None, log=lambda **row: None,
+                           out_of_time=lambda: False, world=World())
 
 
 @pytest.mark.parametrize("slope", [1.0, 1e3])  # the gradient's norm is that, or clipped to 1
@@ -20,10 +25,27 @@ def test_a_step_counts_the_same_in_every_minibatch(slope, monkeypatch, tmp_path)
         steps.append(int(mask.sum()))
         return slope * net.weight.sum()
 
-    run = SimpleNamespace(dir=tmp_path, load_resume=lambda: None, save_resume=lambda state: None, log=lambda **row: None,
-                          out_of_time=lambda: False, world=World())
-    assert supervised.fit(run, net, loss, lambda: None, data, data, seed=0, sequences=8, epochs=1, lr=1e-3, lr_end=1e-3,
+    assert supervised.fit(run_in(tmp_path), net, loss, lambda: None, data, data, seed=0, sequences=8, epochs=1, lr=1e-3, lr_end=1e-3,
                           grad_norm=1.0, validation=64)
     gradients, counts = np.array(told).T
     assert len(told) == 8 and counts.max() > 2 * counts.min()
     assert gradients * counts.sum() / 8 == pytest.approx(counts, rel=1e-4)
+
+
+@pytest.mark.parametrize("fresh", [True, False])
+def test_noise_is_drawn_afresh_in_every_epoch_or_once_a_trajectory(fresh, monkeypatch, tmp_path):
+    lengths = np.arange(20, 84)
+    data = np.zeros((lengths.sum(), 7)), np.concatenate([[0], lengths.cumsum()])
+    net, drawn, observe = torch.nn.Linear(1, 1, bias=False), [], trajectories.observe
+
+    def recorded(data, index, seed, *more):  # what an observation is made of
+        if len(seed) == 5:  # to train
+            drawn.append((*index, *seed))
+        return observe(data, index, seed, *more)
+
+    monkeypatch.setattr(trajectories, "observe", recorded)
+    supervised.fit(run_in(tmp_path), net, lambda *batch: net.weight.sum(), lambda: None, data, data, seed=0, sequences=8,
+                   epochs=2, lr=1e-3, lr_end=1e-3, grad_norm=1.0, validation=8, fresh=fresh)
+    first, second = drawn[:8], drawn[8:16]
+    assert len(second) == 8 and first != second
+    assert not {*first} & {*second} if fresh else {*first} == {*second}
