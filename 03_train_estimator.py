@@ -27,7 +27,7 @@ class Config(command.Reader):
     dropout: float = 0.2  # probability before every linear layer, of ours (sec. 4)
     sequences: int = 100  # trajectories per mini-batch: 30,000 steps, 300 each (tab. estimator_hyperparameters)
     epochs: int = 110  # passes over the training set (tab. estimator_hyperparameters)
-    fresh: bool = command.setting(False, before=True)  # draw noise and occlusions anew in each, not once a trajectory (sec. 3.2)
+    fresh: bool = command.setting(False, before=True)  # draw noise and occlusions every epoch, not once a trajectory (sec. 3.2)
     optimizer: Literal["adam", "muon"] = "adam"  # muon: of the matrices within the net, Adam of the rest (Jordan et al. 2024)
     lr: float = 1e-3  # Adam's learning rate (tab. estimator_hyperparameters), and Muon's
     lr_end: float | None = None  # learning rate at the end of a cosine; none: it stays, as the paper's
@@ -36,7 +36,7 @@ class Config(command.Reader):
 
 
 PRESETS = {
-    "smoke": dict(sizes=(16, 16, 16), sequences=16, epochs=2, fresh=True, validation=12),
+    "smoke": dict(sizes=(16, 16, 16), sequences=16, epochs=2, fresh=True, optimizer="muon", validation=12),
     "quick": dict(sizes=(256, 256, 256), dropout=0.05, sequences=32, epochs=8, fresh=True, optimizer="muon", lr=4e-3,
                   lr_end=5e-5, validation=500),
     "laptop": dict(sizes=(128, 256, 256), dropout=0.05, sequences=32, epochs=10, fresh=True, optimizer="muon", lr=4e-3,

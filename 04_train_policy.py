@@ -148,7 +148,7 @@ def train_bc(run, cfg, paths, device):
         run, student, loss, lambda: weights.save(run.dir / "policy.safetensors", student),
         trajectories.load_set(cfg, "teacher_train")[0], trajectories.load_set(cfg, "teacher_validation")[0],
         seed=cfg.seed, sequences=cfg.bc_sequences, epochs=cfg.bc_epochs, lr=cfg.bc_lr, lr_end=cfg.bc_lr_end,
-        grad_norm=cfg.grad_norm, validation=cfg.bc_validation)
+        grad_norm=cfg.grad_norm, validation=cfg.bc_validation, optimizer="adam", fresh=True)
 
 
 def main(cfg):

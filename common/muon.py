@@ -12,7 +12,7 @@ GATES = 4  # of an LSTM, whose matrices stand one above the other
 
 
 def orthogonal(x):
-    """Matrices (k, m, n) with their singular values, but the very smallest, brought to between 0.7 and 1.2."""
+    """Matrices (k, m, n) with their singular values brought near 1: all but the very small ones to between 0.68 and 1.2."""
     x = x / (x.norm(dim=(1, 2), keepdim=True) + 1e-7)
     flat = x if x.shape[1] <= x.shape[2] else x.mT
     for _ in range(STEPS):
@@ -22,7 +22,7 @@ def orthogonal(x):
 
 
 class Muon(torch.optim.Optimizer):
-    """torch.optim.Muon in the parameters' own precision, as CPUs without bfloat16 need it, and a gate of an LSTM at a time.
+    """torch.optim.Muon without its bfloat16, which many CPUs only imitate, and a gate of an LSTM at a time.
 
     Args: params: matrices, in groups with `blocks`, how many stand one above the other in each; lr: of the same size as Adam's.
     """
@@ -31,18 +31,23 @@ class Muon(torch.optim.Optimizer):
         super().__init__(params, dict(lr=lr, blocks=1))
 
     def step(self):
-        @torch.no_grad()  # in a thread that knows none of ours
-        def descend(p, group):
-            momentum = self.state[p].setdefault("momentum", torch.zeros_like(p)).lerp_(p.grad, 1 - MOMENTUM)
-            blocks = p.grad.lerp(momentum, MOMENTUM).view(group["blocks"], -1, p.shape[1])  # Nesterov's
-            p.sub_(orthogonal(blocks).reshape_as(p), alpha=0.2 * group["lr"] * math.sqrt(max(blocks.shape[1:])))
+        for group in self.param_groups:
+            side_by_side = speed.side_by_side if not group["params"][0].is_cuda else lambda *job: [*map(*job)]
+            side_by_side(lambda p: self._descend(p, **group), group["params"])
 
-        pairs = [(p, group) for group in self.param_groups for p in group["params"]]
-        (map if pairs[0][0].is_cuda else speed.side_by_side)(descend, *zip(*pairs))
+    @torch.no_grad()  # in a thread that knows none of ours
+    def _descend(self, p, lr, blocks, **_):
+        if "momentum" not in self.state[p]:
+            self.state[p]["momentum"] = torch.zeros_like(p)
+        momentum = self.state[p]["momentum"].lerp_(p.grad, 1 - MOMENTUM)
+        update = p.grad.lerp(momentum, MOMENTUM).view(blocks, -1, p.shape[1])  # Nesterov's
+        p.sub_(orthogonal(update).reshape_as(p), alpha=0.2 * lr * math.sqrt(max(update.shape[1:])))
 
 
 def optimizers(net, lr):
-    """Muon for a net's matrices but the first and the last, and Adam for the rest."""
+    """[Muon, Adam] of a net of an LSTM, "lstm" in its parameters' names, and other layers: Muon for its matrices but the first
+    and the last, a gate at a time in the LSTM's, and Adam for the rest.
+    """
     *within, _ = [name for name, p in net.named_parameters() if p.ndim == 2][1:]
     groups = [{"params": [p for name, p in net.named_parameters() if name in within and ("lstm" in name) == gated],
                "blocks": GATES if gated else 1} for gated in (True, False)]

@@ -27,14 +27,14 @@ def validate(loss, data, limit, sequences, device, world):
     return float(np.average(values, weights=steps))
 
 
-def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr_end, grad_norm, validation, optimizer="adam",
-        fresh=True):
-    """Adam (or Muon) over shuffled trajectories, validated on those of `held_out`; False when the time limit stopped it.
+def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr_end, grad_norm, validation, optimizer, fresh):
+    """Descent over shuffled trajectories, validated on those of `held_out`; False when the time limit stopped it.
 
-    An epoch is a resume point, a row of metrics, and draws its mini-batches, noise and occlusions afresh, or has those of the
-    first in another order. loss(o, s, mask, generator) of a batch of trajectories.observe is the mean over the steps it looks
-    at; it may run in two threads at once, draws from the generator alone, and needs every parameter. save() is called on rank 0
-    after each epoch of the lowest validation loss so far. Raises UserError: that is not finite.
+    `optimizer` is "adam", or "muon" for muon.optimizers. An epoch is a resume point, a row of metrics, and draws its
+    mini-batches, noise and occlusions anew or, not `fresh`, has those of the first in another order. loss(o, s, mask, generator)
+    of a batch of trajectories.observe is the mean over the steps it looks at; it may run in two threads at once, draws from the
+    generator alone, and needs every parameter. save() is called on rank 0 after each epoch of the lowest validation loss so
+    far. Raises UserError: that is not finite.
     """
     parameters = list(net.parameters())
     device = parameters[0].device
@@ -42,7 +42,8 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
     count, first, best, lr_end = len(data[1]) - 1, 0, math.inf, lr if lr_end is None else lr_end
     if state := run.load_resume():
         first, best = state["epoch"], state["best"]
-        for part, saved in zip((net, *optimizers), (state["net"], *state["optimizers"])):
+        several = state.get("optimizers") or [state["optimizer"]]  # of older code: one
+        for part, saved in zip((net, *optimizers), (state["net"], *several)):
             part.load_state_dict(saved)
     updates, usual = math.ceil(count / sequences), data[1][-1] / count * sequences  # steps of a mini-batch
     progress = bar(epochs * updates, run.dir.parent.name, initial=first * updates, unit="update")

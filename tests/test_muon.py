@@ -8,7 +8,7 @@ from common import muon, networks
 def test_singular_values_come_near_one(shape):
     x = 1e3 * torch.randn(shape, generator=torch.Generator().manual_seed(0))
     values = torch.linalg.svdvals(muon.orthogonal(x))
-    assert 0.6 < values.min() and values.max() < 1.25
+    assert 0.5 < values.min() and values.max() < 1.25
     u, _, v = torch.linalg.svd(x, full_matrices=False)
     assert (muon.orthogonal(x) - u @ v).abs().max() < 0.4, "it is a rotation of something else"
 

@@ -28,7 +28,6 @@ class Controller:
     def __enter__(self):
         self.running, self.unsolved = True, 0
         if self.thread:  # looking through all objects would keep every thread from its work for 0.2 s: those of now stay
-            gc.unfreeze()
             gc.collect()
             gc.freeze()
         self.arm.begin()
@@ -46,6 +45,7 @@ class Controller:
         finally:
             if self.thread:
                 self.thread.join(2 * SILENCE)
+                gc.unfreeze()
         if self.thread:
             self.arm.require(not self.thread.is_alive(), "the control thread hangs")
             self.arm.check()
