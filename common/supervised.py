@@ -27,6 +27,19 @@ def validate(loss, data, limit, sequences, device, world):
     return float(np.average(values, weights=steps))
 
 
+def _descend(loss, batch, draws, parameters, optimizers, grad_norm, usual):
+    """One step on a mini-batch, weighed by its steps, `usual` ones on average: mean loss and valid steps of all ranks."""
+    halves = speed.halves(batch) if ranks.COUNT == 1 else [batch]  # two threads, or a process each
+    mean, steps = speed.set_gradient(loss, halves, draws, parameters)
+    mean, steps = ranks.average(parameters, mean, steps)
+    torch.nn.utils.clip_grad_norm_(parameters, grad_norm)
+    for parameter in parameters:  # a step counts the same in each mini-batch
+        parameter.grad *= steps / usual
+    for optimizer in optimizers:
+        optimizer.step()
+    return mean.item(), float(steps)
+
+
 def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr_end, grad_norm, validation, optimizer, fresh):
     """Descent over shuffled trajectories, validated on those of `held_out`; False when the time limit stopped it.
 
@@ -34,7 +47,7 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
     mini-batches, noise and occlusions anew or, not `fresh`, has those of the first in another order. loss(o, s, mask, generator)
     of a batch of trajectories.observe is the mean over the steps it looks at; it may run in two threads at once, draws from the
     generator alone, and needs every parameter. save() is called on rank 0 after each epoch of the lowest validation loss so
-    far. Raises UserError: that is not finite.
+    far. Raises UserError: a loss is not finite.
     """
     parameters = list(net.parameters())
     device = parameters[0].device
@@ -47,6 +60,12 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
             part.load_state_dict(saved)
     updates, usual = math.ceil(count / sequences), data[1][-1] / count * sequences  # steps of a mini-batch
     progress = bar(epochs * updates, run.dir.parent.name, initial=first * updates, unit="update")
+
+    def finite(value):
+        if not math.isfinite(value):
+            raise UserError(f"{run.dir}: training diverged in epoch {epoch + 1}: use a lower rate, and --force")
+        return value
+
     for epoch in range(first, epochs):
         drawn = epoch if fresh else 0
         rng = np.random.default_rng([seed, drawn])
@@ -63,21 +82,12 @@ def fit(run, net, loss, save, data, held_out, *, seed, sequences, epochs, lr, lr
             fall = 1 + math.cos(math.pi * ((epoch + k / updates) / epochs))  # along a cosine from 2 to 0
             for group in (group for part in optimizers for group in part.param_groups):
                 group["lr"] = lr_end + (lr - lr_end) * fall / 2
-            halves = speed.halves(batch) if ranks.COUNT == 1 else [batch]  # two threads, or a process each
-            mean, steps = speed.set_gradient(loss, halves, draws, parameters)
-            mean, steps = ranks.average(parameters, mean, steps)
-            torch.nn.utils.clip_grad_norm_(parameters, grad_norm)
-            for parameter in parameters:  # a step counts the same in each mini-batch
-                parameter.grad *= steps / usual
-            for part in optimizers:
-                part.step()
-            losses.append(mean.item())
-            weights.append(float(steps))
+            mean, steps = _descend(loss, batch, draws, parameters, optimizers, grad_norm, usual)
+            losses.append(finite(mean))
+            weights.append(steps)
             progress.update()
             progress.set_postfix_str(f"loss {losses[-1]:.3f}", refresh=False)
-        validation_loss = validate(loss, held_out, validation, sequences, device, run.world)
-        if not math.isfinite(validation_loss):
-            raise UserError(f"{run.dir}: training diverged in epoch {epoch + 1}: use a lower rate, and --force")
+        validation_loss = finite(validate(loss, held_out, validation, sequences, device, run.world))
         run.log(epoch=epoch + 1, train_loss=float(np.average(losses, weights=weights)), validation_loss=validation_loss)
         if validation_loss < best:
             best = validation_loss
