@@ -31,17 +31,15 @@ class Muon(torch.optim.Optimizer):
         super().__init__(params, dict(lr=lr, blocks=1))
 
     def step(self):
-        for group in self.param_groups:
-            side_by_side = speed.side_by_side if not group["params"][0].is_cuda else lambda *job: [*map(*job)]
-            side_by_side(lambda p: self._descend(p, **group), group["params"])
+        speed.side_by_side(self._descend, *zip(*((p, group) for group in self.param_groups for p in group["params"])))
 
     @torch.no_grad()  # in a thread that knows none of ours
-    def _descend(self, p, lr, blocks, **_):
+    def _descend(self, p, group):
         if "momentum" not in self.state[p]:
             self.state[p]["momentum"] = torch.zeros_like(p)
         momentum = self.state[p]["momentum"].lerp_(p.grad, 1 - MOMENTUM)
-        update = p.grad.lerp(momentum, MOMENTUM).view(blocks, -1, p.shape[1])  # Nesterov's
-        p.sub_(orthogonal(update).reshape_as(p), alpha=0.2 * lr * math.sqrt(max(update.shape[1:])))
+        update = p.grad.lerp(momentum, MOMENTUM).view(group["blocks"], -1, p.shape[1])  # Nesterov's
+        p.sub_(orthogonal(update).reshape_as(p), alpha=0.2 * group["lr"] * math.sqrt(max(update.shape[1:])))
 
 
 def optimizers(net, lr):
