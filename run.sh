@@ -21,7 +21,7 @@ if ! cmp -s requirements.txt .venv/installed.txt; then
 fi
 
 if [ "$what" = test ]; then
-    .venv/bin/python -m pytest -q -n 2 --dist loadfile --ignore tests/test_robot_stops.py
+    .venv/bin/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --ignore tests/test_robot_stops.py
     exec .venv/bin/python -m pytest -q tests/test_robot_stops.py  # times and signals: alone
 fi
 scripts=(0*.py)

@@ -3,7 +3,7 @@ import math
 
 import torch
 
-from common import speed
+from common import ranks, speed
 
 MOMENTUM = 0.95
 STEPS = 5  # of the Newton-Schulz iteration
@@ -31,15 +31,26 @@ class Muon(torch.optim.Optimizer):
         super().__init__(params, dict(lr=lr, blocks=1))
 
     def step(self):
-        speed.side_by_side(self._descend, *zip(*((p, group) for group in self.param_groups for p in group["params"])))
+        """One step; the matrices are shared out among the processes."""
+        jobs = sorted(((p, group) for group in self.param_groups for p in group["params"]), key=_work, reverse=True)
+        owners = ranks.owners(map(_work, jobs))
+        speed.side_by_side(self._descend, *zip(*jobs), owners)
+        ranks.hand_out([p.data for p, _ in jobs], owners)
 
     @torch.no_grad()  # in a thread that knows none of ours
-    def _descend(self, p, group):
+    def _descend(self, p, group, owner):
         if "momentum" not in self.state[p]:
             self.state[p]["momentum"] = torch.zeros_like(p)
         momentum = self.state[p]["momentum"].lerp_(p.grad, 1 - MOMENTUM)
         update = p.grad.lerp(momentum, MOMENTUM).view(group["blocks"], -1, p.shape[1])  # Nesterov's
-        p.sub_(orthogonal(update).reshape_as(p), alpha=0.2 * group["lr"] * math.sqrt(max(update.shape[1:])))
+        if owner == ranks.RANK:
+            p.sub_(orthogonal(update).reshape_as(p), alpha=0.2 * group["lr"] * math.sqrt(max(update.shape[1:])))
+
+
+def _work(job):
+    """Of making a parameter's step orthogonal, but for a factor."""
+    p, group = job
+    return p.numel() * min(p.numel() // p.shape[1] // group["blocks"], p.shape[1])
 
 
 def optimizers(net, lr):

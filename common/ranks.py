@@ -75,6 +75,22 @@ def spread(jobs, work):
     return [done[i % COUNT][i // COUNT] for i in range(len(jobs))] if RANK == 0 else []
 
 
+def owners(work):
+    """Ranks for jobs of so much work each, the dearest first: each goes to the rank with the least so far."""
+    loads, ranks = [0] * COUNT, []
+    for dear in work:
+        ranks.append(loads.index(min(loads)))
+        loads[ranks[-1]] += dear
+    return ranks
+
+
+def hand_out(tensors, ranks):
+    """Gives all ranks, for each tensor, its value on the rank given."""
+    if COUNT > 1:
+        for tensor, rank in zip(tensors, ranks):
+            dist.broadcast(tensor, rank)
+
+
 def totals(*numbers):
     """Sums of numbers over all ranks."""
     sums = torch.tensor(numbers, dtype=torch.float64)

@@ -20,6 +20,12 @@ speed.set_up()
 SCRIPTS = ["01_train_privileged", "02_collect", "03_train_estimator", "04_train_policy", "05_evaluate", "06_robot"]
 
 
+def pytest_collection_modifyitems(items):
+    """The files that take longest come first, so that no worker waits for the other at the end; the first makes the study."""
+    slow = ["test_methods.py", "test_ranks.py", "test_stages.py", "test_robot_runs.py"]
+    items.sort(key=lambda item: slow.index(item.path.name) if item.path.name in slow else len(slow))
+
+
 @pytest.fixture(autouse=True)
 def seeded():
     torch.manual_seed(0)

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-from common import command, networks, ppo, ranks, speed, stacks, training  # noqa: E402
+from common import command, muon, networks, ppo, ranks, speed, stacks, training  # noqa: E402
 from conftest import ROOT, SCRIPTS, start  # noqa: E402
 
 HP = import_module("01_train_privileged").Config(
@@ -74,6 +74,20 @@ def regression(index):
     return {"loss": mean, "steps": float(steps), "gradient": [p.grad for p in parameters]}
 
 
+def muon_steps():
+    """A net after three steps by Muon, with gradients that both ranks have alike, and how often this rank made one orthogonal."""
+    torch.manual_seed(0)
+    net, calls, whole = networks.Estimator((16, 32, 48)), [], muon.orthogonal
+    matrices = muon.optimizers(net, lr=0.01)[0]
+    muon.orthogonal = lambda x: calls.append(x.shape) or whole(x)
+    for _ in range(3):
+        for p in net.parameters():
+            p.grad = torch.randn(p.shape)
+        matrices.step()
+    muon.orthogonal = whole
+    return {"net": net.state_dict(), "momentum": matrices.state_dict()["state"], "calls": len(calls)}
+
+
 def ten_updates():
     """Both nets after training.train, with the loop's own worlds."""
     env, held_out = (stacks.make(stacks.METHODS["priv_on_state"], n) for n in training.shares(HP))
@@ -88,6 +102,7 @@ def measure(out):
     ranks.begin(torch.device("cpu"))
     mine = range(ranks.RANK, 12, 2)
     torch.save({"update": one_update([*mine]), "regression": regression([*range(ranks.RANK, 8, 2)]), "trained": ten_updates(),
+                "muon": muon_steps(),
                 "spread": ranks.spread([*range(5)], lambda job: (job, ranks.RANK)), "shares": ranks.share(5)},
                f"{out}/{ranks.RANK}.pt")
     ranks.end()
@@ -133,6 +148,15 @@ def test_a_mini_batch_of_two_counts_every_step_the_same(of_both):
     alone = regression([*range(8)])
     for rank in of_both:
         torch.testing.assert_close(rank["regression"], alone, rtol=1e-5, atol=1e-5)
+
+
+def test_muon_shares_its_matrices_out_and_steps_as_one_process_does(of_both):
+    alone = muon_steps()
+    for rank, calls in zip(of_both, (3, 6)):  # the dearest of three matrices is rank 0's
+        torch.testing.assert_close(rank["muon"]["net"], alone["net"], rtol=0, atol=0)
+        torch.testing.assert_close(rank["muon"]["momentum"], alone["momentum"], rtol=0, atol=0)
+        assert rank["muon"]["calls"] == calls
+    assert alone["calls"] == 9
 
 
 def test_the_nets_of_both_are_equal_after_ten_updates(of_both):
