@@ -45,8 +45,8 @@ class Config(Cloned, Reinforced, command.Reader):
     sizes: tuple[int, int, int] | None = (128, 256, 128)  # linear, LSTM and linear layer (appendix B.1); none: pi_priv's
 
 
-_QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy_coef=0.0005, kl_target=0.015,
-              kl_target_end=0.003, lr=3e-4, lr_min=2e-5, lr_max=2e-3, sizes=None, warm_start=True, privileged_critic=True,
+_QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy_coef=0.0005, kl_target=0.006,
+              kl_target_end=0.002, lr=3e-4, lr_min=2e-5, lr_max=2e-3, sizes=None, warm_start=True, privileged_critic=True,
               bc_lr=2e-3, bc_lr_end=5e-5)
 PRESETS = {
     "smoke": dict(num_envs=32, rollout_steps=16, updates=4, minibatch=256, epochs=2, sizes=None, eval_every=4,

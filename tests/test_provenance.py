@@ -22,7 +22,8 @@ WORLD = ["--starts", "inner", "--support", *map(repr, C_060), "--support-offset"
 RECIPE = {"01_train_privileged": [*WORLD, "--sizes", "128", "256", "128", "--updates", "1000", "--kl-target-end", "None",
                                   "--lr-min", "1e-4"],
           "03_train_estimator": ["--sizes", "256", "256", "256", "--dropout", "0.2", "--epochs", "20",
-                                 "--optimizer", "adam"]}
+                                 "--optimizer", "adam"],
+          "04_train_policy": ["--kl-target", "0.015", "--kl-target-end", "0.003"]}
 RECORDS = [path.parent.relative_to(ROOT / "pretrained") for path in sorted((ROOT / "pretrained").rglob("config.json"))]
 PUBLISHED = [folder for folder in RECORDS if folder.parts[0] != "next"]  # in the world, and by the recipe, of before
 
