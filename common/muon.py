@@ -42,8 +42,8 @@ class Muon(torch.optim.Optimizer):
         if "momentum" not in self.state[p]:
             self.state[p]["momentum"] = torch.zeros_like(p)
         momentum = self.state[p]["momentum"].lerp_(p.grad, 1 - MOMENTUM)
-        update = p.grad.lerp(momentum, MOMENTUM).view(group["blocks"], -1, p.shape[1])  # Nesterov's
         if owner == ranks.RANK:
+            update = p.grad.lerp(momentum, MOMENTUM).view(group["blocks"], -1, p.shape[1])  # Nesterov's
             p.sub_(orthogonal(update).reshape_as(p), alpha=0.2 * group["lr"] * math.sqrt(max(update.shape[1:])))
 
 
