@@ -19,7 +19,6 @@ from common import task
 from common.progress import bar
 from common.robot import controller, ik, safety
 from common.robot.iiwa import IIWA
-from common.robot.model import Model
 
 RUN = 60  # ticks at most
 SLACK = 1.1  # the guard knows the arm by its readings, of which small errors cannot be seen
@@ -144,20 +143,6 @@ class Arm:
         self.raised("stop")
 
 
-def remembered(function):
-    """The last results of a function of an array: guard, solver and oracle ask for the same ones."""
-    known = {}
-
-    def of(model, q):
-        if len(known) > 50:
-            known.clear()
-        key = model, q.tobytes()
-        if key not in known:
-            known[key] = function(model, q)
-        return known[key]
-    return of
-
-
 def solver(rng, rate, real):
     """The quadratic program, or the same velocities without its limits, at a fifth of the time; each fails at random."""
     def solve(model, q, velocity):
@@ -178,8 +163,7 @@ def fuzz(ticks, seed=0, model=IIWA):
     """Returns how many ticks had a fault, how often each reason stopped the arm, unsafe commands, exceptions but Stop."""
     rng, played, faulty, reasons, unsafe, escaped = np.random.default_rng(seed), 0, 0, Counter(), [], []
     starts = [model.joints_at(xy) for xy in rng.uniform(-1, 1, (50, 2)) * task.HALF]
-    wall, program, chain, progress = safety.wall, ik.solve, Model.chain, bar(ticks, "fuzz", unit="tick")
-    Model.chain = remembered(chain)
+    wall, program, progress = safety.wall, ik.solve, bar(ticks, "fuzz", unit="tick")
     zeros, small = np.zeros(len(model.limits)), np.full(len(model.limits), 0.01)
     try:
         while played < ticks:
@@ -212,7 +196,7 @@ def fuzz(ticks, seed=0, model=IIWA):
             unsafe += arm.unsafe
             progress.update(played - before)
     finally:
-        safety.wall, ik.solve, Model.chain = wall, program, chain
+        safety.wall, ik.solve = wall, program
     return SimpleNamespace(ticks=played, faulty=faulty, reasons=reasons, unsafe=unsafe, escaped=escaped)
 
 

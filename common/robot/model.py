@@ -4,7 +4,7 @@ World frame: the workspace's (task.py), z up from the table. Tool frame: the fla
 zero all frames of an arm are parallel to its base's.
 """
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -43,9 +43,13 @@ class Model:
         """Kinematics at joint angles (n,), world frame.
 
         Returns axes (n, 3) of the joints; points (n + 2, 3) in m: one on each axis, the flange, the ball's centre; the tool's
-        rotation (3, 3).
+        rotation (3, 3): all read-only, for those of the last angles are kept: arm, guard and program ask for the same ones.
         """
-        n, (skew, skew2) = len(self.limits), self._skew
+        return self._chain(np.asarray(q, float).tobytes())
+
+    @lru_cache(maxsize=64)
+    def _chain(self, angles):
+        q, n, (skew, skew2) = np.frombuffer(angles), len(self.limits), self._skew
         turns = np.eye(3) + np.sin(q)[:, None, None] * skew + (1 - np.cos(q))[:, None, None] * skew2  # Rodrigues
         rotation, point, axes, points = self.facing, self.base, np.empty((n, 3)), np.empty((n + 2, 3))
         for i, offset in enumerate(self.offsets):
@@ -53,6 +57,8 @@ class Model:
             rotation = rotation @ turns[i]
             point = point + rotation @ offset
         points[n:] = point, point + rotation @ self.tool
+        for part in (axes, points, rotation):
+            part.flags.writeable = False
         return axes, points, rotation
 
     def jacobian(self, axes, points):
