@@ -95,9 +95,10 @@ def passes(head, z, count):
     """`count` calls of head(z, generator), each with draws of its own, stacked: outputs (count, *z.shape[:-1], .).
 
     Several calls at a time, as one on the expanded z: as many as the memory allows, and at least two parts, on a CPU in two
-    threads unless these are done before the threads would have begun. The draws are the same for any number of threads.
+    threads; as one where it is done before the threads would have begun. The draws are the same for any number of threads.
     """
-    at_once = min(max(1, 2**15 // z[..., 0].numel()), (count + 1) // 2)
+    small = count * z.numel() <= 2**16
+    at_once = min(max(1, 2**15 // z[..., 0].numel()), count if small else (count + 1) // 2)
     counts = [min(at_once, count - i) for i in range(0, count, at_once)]
     seeds, graph = torch.randint(2**62, (len(counts),)).tolist(), torch.is_grad_enabled()
 
@@ -105,7 +106,7 @@ def passes(head, z, count):
         with torch.set_grad_enabled(graph), _bfloat16(z.device, z.dtype == torch.bfloat16):
             return head(z.expand(part, *z.shape), torch.Generator(z.device).manual_seed(seed))
 
-    outputs = (side_by_side if z.device.type == "cpu" and count * z.numel() > 2**16 else map)(several, counts, seeds)
+    outputs = (map if small or z.device.type != "cpu" else side_by_side)(several, counts, seeds)
     return [None if parts[0] is None else torch.cat(parts) for parts in zip(*outputs)]
 
 

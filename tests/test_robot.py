@@ -251,6 +251,19 @@ def test_the_camera_is_a_frame_late_and_says_so():
     assert np.abs(cv2.GaussianBlur(image, (0, 0), 5).astype(int) - cv2.GaussianBlur(expected, (0, 0), 5)).mean() < 1.5
 
 
+def test_an_image_that_was_begun_ahead_is_the_one_that_is_due():
+    arms = [placed(hardware.Gaps(**vars(STILL) | {"latency": 1})) for _ in range(2)]
+    for arm in arms:
+        list(drive(arm, (0.05, 0.0), 2))
+        arm.grab()
+    arms[0].look_ahead()
+    for arm in arms:
+        list(drive(arm, (0.0, 0.05), 1))
+    (begun, _), (taken, image), (due, other) = arms[0].coming, arms[0].grab(), arms[1].grab()
+    assert begun == taken == due and not np.isfinite(arms[1].coming[0])
+    assert np.abs(cv2.GaussianBlur(image, (0, 0), 5).astype(int) - cv2.GaussianBlur(other, (0, 0), 5)).mean() < 0.5
+
+
 def test_hand_eye_error_shifts_what_is_seen():
     arm = placed(hardware.Gaps(**vars(STILL) | {"hand_eye_mm": 5.0}))
     sight = tags.Tracker().update(arm.grab()[1], scene.wrist_camera(arm.model, arm.joints))

@@ -60,6 +60,8 @@ class Controller:
 
     def tick(self):
         """Returns at the end of the control step, and for how long that was waited, in s."""
+        if self.arm.simulated:
+            self.arm.simulated.look_ahead()
         if not self.thread:
             self._play(ik.STEPS - self.late)
             return 0.0

@@ -8,7 +8,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from common import geometry, simulator, task
+from common import geometry, simulator, speed, task
 from common.files import UserError
 from common.robot import ik, scene
 from common.robot.iiwa import IIWA
@@ -72,6 +72,7 @@ class SimulatedArm:
         self.bias, self.noise = rng.normal(0, g.force_bias, 3), rng.normal(0, g.force_noise, 3)  # N
         self.past = deque(maxlen=1 + round(g.latency * ik.STEPS))
         self.joined, self.ended, self.held, self.nudges = False, False, 0.0, deque(maxlen=100)
+        self.since, self.coming = 0, (-np.inf, None)  # steps since the last image; the next one and its time
         self.remember()
 
     @property
@@ -92,9 +93,23 @@ class SimulatedArm:
         felt = np.append(self.worlds.force[0], 0.0) - self.gaps.tool_mass * self.acceleration
         return self.time, self.rotation.T @ felt + self.bias + self.noise
 
+    def expose(self, index):
+        """Time of a state of the past, and its image, which a thread draws."""
+        taken, box, joints, points, covered = self.past[index]
+        camera, rng = scene.wrist_camera(self.model, joints, self.error), self.rng.spawn(1)[0]
+        return taken, speed.pool.submit(scene.photograph, camera, box, points, covered, rng)
+
+    def look_ahead(self):
+        """Begins with the image that is due when this control step ends, if its moment is past already, as a late camera's is."""
+        rest = ik.STEPS - self.since
+        if 0 <= rest < len(self.past):
+            self.coming = self.expose(rest)
+
     def grab(self):
-        taken, box, joints, points, covered = self.past[0]
-        return taken, scene.photograph(scene.wrist_camera(self.model, joints, self.error), box, points, covered, self.rng)
+        due = abs(self.coming[0] - self.past[0][0]) < 0.5 / task.RATE
+        taken, image = self.coming if due else self.expose(0)
+        self.since = 0
+        return taken, image.result()
 
     def command(self, velocity):
         wanted, lag = np.zeros(len(self.joints)) if self.stopped else velocity, self.gaps.servo_lag
@@ -112,6 +127,7 @@ class SimulatedArm:
         if round(self.time * ik.QP_RATE) % ik.STEPS == 1:  # one draw a control step, and no mean makes it less
             self.noise = self.rng.normal(0, self.gaps.force_noise, 3)
         self.remember()
+        self.since += 1
 
     def stop(self):
         self.stopped, self.speeds = True, np.zeros(len(self.model.limits))
