@@ -94,8 +94,8 @@ class EvenLSTM(nn.LSTM):
 def passes(head, z, count):
     """`count` calls of head(z, generator), each with draws of its own, stacked: outputs (count, *z.shape[:-1], .).
 
-    Several calls at a time, as one on the expanded z: as many as the memory allows, and at least two parts, on a CPU in two
-    threads; as one where it is done before the threads would have begun. The draws are the same for any number of threads.
+    Several calls at a time, as one on the expanded z: all of them where that is small, else as many as the memory allows, and
+    at least two parts, on a CPU in the pool's threads. The draws are the same for any number of threads.
     """
     small = count * z.numel() <= 2**16
     at_once = min(max(1, 2**15 // z[..., 0].numel()), count if small else (count + 1) // 2)

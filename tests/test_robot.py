@@ -251,17 +251,31 @@ def test_the_camera_is_a_frame_late_and_says_so():
     assert np.abs(cv2.GaussianBlur(image, (0, 0), 5).astype(int) - cv2.GaussianBlur(expected, (0, 0), 5)).mean() < 1.5
 
 
-def test_an_image_that_was_begun_ahead_is_the_one_that_is_due():
-    arms = [placed(hardware.Gaps(**vars(STILL) | {"latency": 1})) for _ in range(2)]
-    for arm in arms:
-        list(drive(arm, (0.05, 0.0), 2))
-        arm.grab()
-    arms[0].look_ahead()
-    for arm in arms:
-        list(drive(arm, (0.0, 0.05), 1))
-    (begun, _), (taken, image), (due, other) = arms[0].coming, arms[0].grab(), arms[1].grab()
-    assert begun == taken == due and not np.isfinite(arms[1].coming[0])
-    assert np.abs(cv2.GaussianBlur(image, (0, 0), 5).astype(int) - cv2.GaussianBlur(other, (0, 0), 5)).mean() < 0.5
+@pytest.mark.parametrize("latency", [0, 0.5, 1, 1.5, 2])
+@pytest.mark.parametrize("before", [0, 4, 6])
+def test_an_image_that_was_begun_ahead_is_the_one_that_is_due(latency, before):
+    arm, slow = placed(hardware.Gaps(**vars(STILL) | {"latency": latency})), np.full(7, 0.01)
+    for _ in range(4):  # from the start on, where the camera has not seen as much as it is late
+        for step in range(ik.STEPS):
+            if step == before:
+                arm.look_ahead()
+            arm.command(slow)
+        (begun, coming), (taken, image) = arm.coming, arm.grab()
+        assert taken == arm.past[0][0]
+        known = ik.STEPS - before <= round(latency * ik.STEPS)
+        assert known == (begun == taken and image is coming.result())
+    for _ in range(ik.STEPS):
+        arm.command(slow)
+    assert arm.grab()[0] == arm.past[0][0] != taken
+
+
+def test_a_run_shows_no_image_of_the_last_one():
+    arm = placed(hardware.Gaps(**vars(STILL) | {"latency": 1}))
+    arm.look_ahead()
+    _, last = arm.coming
+    arm.place(np.random.default_rng(1), np.array([0.1, 0.0, 0.0]), np.array([-0.1, 0.0]), {})
+    taken, image = arm.grab()
+    assert taken == 0 and image is not last.result()
 
 
 def test_hand_eye_error_shifts_what_is_seen():

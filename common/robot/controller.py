@@ -59,7 +59,7 @@ class Controller:
         self.target, self.aimed = velocity, time.monotonic()
 
     def tick(self):
-        """Returns at the end of the control step, and for how long that was waited, in s."""
+        """Returns at the end of the control step, with a simulated image begun, and for how long that was waited, in s."""
         if self.arm.simulated:
             self.arm.simulated.look_ahead()
         if not self.thread:

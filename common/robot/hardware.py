@@ -72,7 +72,7 @@ class SimulatedArm:
         self.bias, self.noise = rng.normal(0, g.force_bias, 3), rng.normal(0, g.force_noise, 3)  # N
         self.past = deque(maxlen=1 + round(g.latency * ik.STEPS))
         self.joined, self.ended, self.held, self.nudges = False, False, 0.0, deque(maxlen=100)
-        self.since, self.coming = 0, (-np.inf, None)  # steps since the last image; the next one and its time
+        self.since, self.coming = 0, (-np.inf, None)  # steps since the last image; the next one's time, and its future
         self.remember()
 
     @property
@@ -94,19 +94,19 @@ class SimulatedArm:
         return self.time, self.rotation.T @ felt + self.bias + self.noise
 
     def expose(self, index):
-        """Time of a state of the past, and its image, which a thread draws."""
+        """Time of a state of the past, and the future of its image, which a thread draws."""
         taken, box, joints, points, covered = self.past[index]
         camera, rng = scene.wrist_camera(self.model, joints, self.error), self.rng.spawn(1)[0]
         return taken, speed.pool.submit(scene.photograph, camera, box, points, covered, rng)
 
     def look_ahead(self):
-        """Begins with the image that is due when this control step ends, if its moment is past already, as a late camera's is."""
-        rest = ik.STEPS - self.since
-        if 0 <= rest < len(self.past):
-            self.coming = self.expose(rest)
+        """Has a thread draw the image that is due when the control step ends, where the camera is so late that it can be."""
+        rest, full = ik.STEPS - self.since, self.past.maxlen
+        if 0 <= rest < full:
+            self.coming = self.expose(max(0, rest + len(self.past) - full))
 
     def grab(self):
-        due = abs(self.coming[0] - self.past[0][0]) < 0.5 / task.RATE
+        due = abs(self.coming[0] - self.past[0][0]) < 0.5 / task.RATE  # in real time a grab is a step early or late
         taken, image = self.coming if due else self.expose(0)
         self.since = 0
         return taken, image.result()

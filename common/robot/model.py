@@ -20,7 +20,10 @@ def _cross(a, b):
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """An arm of n joints that turn, and where it stands; axes and offsets in the base's frame, at angles of zero."""
+    """An arm of n joints that turn, and where it stands; axes and offsets in the base's frame, at angles of zero.
+
+    Its arrays are not to be changed: `chain` remembers.
+    """
 
     axes: np.ndarray  # (n, 3), unit vectors along the joints
     offsets: np.ndarray  # (n, 3) in m, from each joint to the next, and from the last to the flange
@@ -43,7 +46,7 @@ class Model:
         """Kinematics at joint angles (n,), world frame.
 
         Returns axes (n, 3) of the joints; points (n + 2, 3) in m: one on each axis, the flange, the ball's centre; the tool's
-        rotation (3, 3): all read-only, for those of the last angles are kept: arm, guard and program ask for the same ones.
+        rotation (3, 3). All are read-only, and kept for a while: arm, guard and program ask for the same angles.
         """
         return self._chain(np.asarray(q, float).tobytes())
 

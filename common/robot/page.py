@@ -59,9 +59,9 @@ follow()
 
 def paint(pipe):
     """The painter's process: answers each tick, as views.composite takes it, with its JPEG, until the other end is closed."""
-    os.nice(19)
+    os.nice(10)
     with contextlib.suppress(OSError):  # Linux shares the cores among sessions first, and within each by niceness
-        Path("/proc/self/autogroup").write_text("19")
+        Path("/proc/self/autogroup").write_text("10")
     cv2.setNumThreads(1)
     pipe.send_bytes(b"")  # ready
     with contextlib.suppress(EOFError, OSError):
