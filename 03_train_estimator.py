@@ -65,6 +65,11 @@ def train(run, cfg, train_set, validation_set, device):
         validation=cfg.validation, optimizer=cfg.optimizer, fresh=cfg.fresh)
 
 
+def settings_of(cfg):
+    """Names of the settings that a method reads."""
+    return {field.name for field in fields(cfg)} - ({"dropout"} if not TRAINED[cfg.method].dropout else set())
+
+
 def against_passes(estimator, data, cfg, device, world):
     """{M: sums of trajectories.measure} on the validation set; without dropout for M = 1, as every pass is the same."""
     return {m: trajectories.measure(data, cfg.validation, cfg.sequences, 3, device,
@@ -81,8 +86,7 @@ def main(cfg):
         train_set, paths = trajectories.load_set(cfg, "train")
         supervised.check(train_set, cfg.sequences)
         validation_set, validation_paths = trajectories.load_set(cfg, "validation")
-        reads = {field.name for field in fields(cfg)} - ({"dropout"} if not TRAINED[method].dropout else set())
-        run = runs.Run(cfg, "03_train_estimator", paths | validation_paths, method, reads)
+        run = runs.Run(cfg, "03_train_estimator", paths | validation_paths, method, settings_of(cfg))
         if run.skip():
             continue
         if not train(run, cfg, train_set, validation_set, device):
