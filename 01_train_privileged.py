@@ -27,7 +27,8 @@ _QUICK = dict(num_envs=1024, rollout_steps=32, minibatch=4096, epochs=3, entropy
               lr_max=2e-3, sizes=(64, 128, 64), tolerance=4.0, near_share=0.8)
 PRESETS = {
     "smoke": dict(num_envs=32, rollout_steps=16, updates=6, minibatch=256, epochs=2, sizes=(16, 16, 16), checkpoints=3,
-                  eval_every=3, eval_episodes=16, resume_every=2, tolerance=4.0, near_share=0.5),
+                  eval_every=3, eval_episodes=16, resume_every=2, tolerance=4.0, near_share=0.5,
+                  world=World(time_limit=4.0)),
     "quick": _QUICK | dict(updates=500, checkpoints=26),
     "laptop": _QUICK | dict(updates=1500, kl_target_end=0.005, lr_min=2e-5, checkpoints=100),
     "paper": dict(tolerance=4.0, near_share=0.8),  # without: nothing learned in 10 million steps (results/README.md)

@@ -117,11 +117,11 @@ def think(f, pi, passes, row, memory):
     return symmetry.mirror(s_hat, sign)[0], action[0], (sign, hidden, recall)
 
 
-def control(drive, f, pi, cfg, hand, rows, screen):
+def control(drive, f, pi, cfg, hand, horizon, rows, screen):
     """One run: grab -> track -> believe -> act -> aim, 15 times a second. Returns how it ended.
 
-    `drive` is a controller.Controller, `hand` (from, to) in s for who covers the tags of a real arm; `rows` is a list that gets
-    a dict a tick, which the page.Page `screen` shows, if there is one.
+    `drive` is a controller.Controller, `hand` (from, to) in s for who covers the tags of a real arm, `horizon` the most ticks;
+    `rows` is a list that gets a dict a tick, which the page.Page `screen` shows, if there is one.
     """
     arm, simulated = drive.arm, drive.arm.simulated
     cues = {int(moment * task.RATE): f"now {word} the tags" for moment, word in zip(hand, ("cover", "uncover")) if moment < 60}
@@ -134,7 +134,7 @@ def control(drive, f, pi, cfg, hand, rows, screen):
     else:
         return f"box not seen for {PATIENCE // task.RATE} s"
 
-    for tick in range(task.HORIZON):
+    for tick in range(horizon):
         began = time.perf_counter()
         row = sense(arm, tracker) if tick else row
         row |= dict(true=simulated.box.copy() if simulated else np.full(3, np.nan), covered=bool(simulated and simulated.covered))
@@ -169,7 +169,7 @@ def perform(arm, f, pi, run, logs, scenario, k, screen):
         screen.begin(f"{scenario}, run {k + 1}")
     try:
         with controller.Controller(arm, run.cfg.realtime or not arm.simulated, run.cfg.think) as drive:
-            ended = control(drive, f, pi, run.cfg, hand, rows, screen)
+            ended = control(drive, f, pi, run.cfg, hand, run.world.horizon, rows, screen)
     except safety.Stop as reason:
         if arm.simulated and (isinstance(reason.__context__, KeyboardInterrupt) or page.BUTTON in arm.stopped):
             raise  # not the policy's failure: the same command plays the run again

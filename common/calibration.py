@@ -98,14 +98,14 @@ def summary(tallies):
         "nees_count": (aged > 0).sum(0).tolist()}
 
 
-def course(variance, length, success):
-    """Of each episode (N, 2 + 20): length, whether it left the workspace (nan where the time was out, or all used), sigma in mm
-    at each second.
+def course(variance, length, success, horizon):
+    """Of each episode (N, 2 + seconds): length, whether it left the workspace (nan where the time was out, or all used), and
+    sigma in mm at each second.
 
-    From scaled variances (T, N, 4), lengths (N,) and success (N,).
+    From scaled variances (T, N, 4), lengths (N,), success (N,) and the most steps that there can be.
     """
-    left = np.where(success, 0.0, np.where(length < task.HORIZON, 1.0, np.nan))
-    sigma = np.full((task.HORIZON, len(length)), np.nan)
+    left = np.where(success, 0.0, np.where(length < horizon, 1.0, np.nan))
+    sigma = np.full((horizon, len(length)), np.nan)
     sigma[:len(variance)] = 1e3 * np.sqrt((variance[..., :2] * task.HALF**2).sum(-1))
     return np.column_stack([length, left, sigma[::task.RATE].T])
 
@@ -119,8 +119,8 @@ def area(score, label, weight):
 
 
 def foreseen(courses):
-    """How well sigma tells, each second of an episode (N, 22), whether it leaves the workspace within 2 s: areas under ROC
-    curves of sigma, its rise in the last second, and elapsed time alone, with intervals over episodes. Time-outs left out;
+    """How well sigma tells, each second of an episode, whether it leaves the workspace within 2 s, from `course`'s rows: areas
+    under ROC curves of sigma, its rise in the last second, and elapsed time alone, with intervals over episodes. Time-outs left out;
     none if there is nothing to tell apart.
     """
     courses = np.asarray(courses, float)

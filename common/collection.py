@@ -45,7 +45,7 @@ class Drifting(EpisodeWrapper):
 
 def collect(policy, world, num_envs, seed, drifting=0):
     """States (steps, 7), lengths and success of one sampled episode a world; the last `drifting` ones see the box drift."""
-    states = np.empty((task.HORIZON, num_envs, 7), np.float32)
+    states = np.empty((world.horizon, num_envs, 7), np.float32)
 
     def record(t, env):
         states[t] = env.unwrapped.state
@@ -53,4 +53,4 @@ def collect(policy, world, num_envs, seed, drifting=0):
     torch.manual_seed(seed)
     env = symmetry.Mirrored(Drifting(PushVectorEnv(num_envs, world=world), drifting))
     success, length = episodes.play(env, policy, seed, greedy=False, record=record)
-    return states.swapaxes(0, 1)[np.arange(task.HORIZON) < length[:, None]], length, success
+    return states.swapaxes(0, 1)[np.arange(world.horizon) < length[:, None]], length, success

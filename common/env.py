@@ -19,7 +19,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
     Action: MultiDiscrete([11, 11]) a world; bin k is a pusher velocity of (k - 5) * 0.01 m/s along x or y, held for 1/15 s.
     Observation: (N, 8) float32, the true state scaled as in appendix B (task.scale).
     Reward: sec. 4 (task.reward). Termination: success (looked at first) or the centre of box or pusher outside
-    the workspace. Truncation: after 300 steps.
+    the workspace. Truncation: at the world's time limit.
     Infos: `state` (N, 7) true states in SI units and `success` (N,) of this step. Where an episode ended, `_final_obs` (N,)
     is set, `final_obs` (N, 8) and `final_state` (N, 7) hold its end, and observation and `state` start the next episode.
 
@@ -112,7 +112,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
         success = task.reached(self.box, self.tolerance)
         out = task.outside(self.box, self.pusher)
         terminated = success | out
-        truncated = ~terminated & (self._steps >= task.HORIZON)
+        truncated = ~terminated & (self._steps >= self.world.horizon)
         return task.reward(self.box, velocity, success, out), terminated, truncated, success
 
     def step(self, action):

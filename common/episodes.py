@@ -2,7 +2,6 @@
 import numpy as np
 import torch
 
-from common import task
 from common.networks import mode, sample
 from common.speed import autocast
 
@@ -16,7 +15,7 @@ def play(env, actor, seed, greedy=True, record=None):
     device = next(actor.parameters()).device
     obs, _ = env.reset(seed=seed)
     running, success, length, hidden = np.ones(len(obs), bool), np.zeros(len(obs), bool), np.zeros(len(obs), int), None
-    for t in range(task.HORIZON):
+    for t in range(env.unwrapped.world.horizon):
         if record:
             record(t, env)
         with autocast(device):

@@ -65,7 +65,7 @@ def other_worlds(world):
         "box=+2cm_wide": {"box": (length, width + 0.02, height)},
         "noise=2x": {"noise": tuple(2 * x for x in world.noise)}, "bias=2x": {"bias": tuple(2 * x for x in world.bias)},
         "force=0.7x": {"gain": 0.7}, "force=1.3x": {"gain": 1.3}, "late=1": {"late": 1}, "late=2": {"late": 2},
-        "surface=1.5": {"surface": 1.5}, "surface=4": {"surface": 4.0}}
+        "surface=1.5": {"surface": 1.5}, "surface=4": {"surface": 4.0}, "time=30s": {"time_limit": 30.0}}
     worlds = {}
     for row, change in changes.items():
         with suppress(ValueError):

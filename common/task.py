@@ -15,7 +15,6 @@ RADIUS = 0.013  # the spherical pusher
 
 # Time and actions (sec. 4): 11 bins a velocity, bin k is (k - 5) * 0.01 m/s
 RATE = 15  # control frequency, Hz
-HORIZON = 300  # steps, 20 s
 BINS = 11
 MAX_SPEED = 0.05  # m/s, along each axis
 SPEEDS = np.linspace(-MAX_SPEED, MAX_SPEED, BINS)
@@ -68,6 +67,7 @@ class World:
     occlusion_start: float = 1 / 30  # probability at each visible step (tab. occlusion_and_noise_params)
     occlusion: Range = (10.0, 5.0)  # mean and standard deviation of its duration in s (tab. occlusion_and_noise_params)
     max_force: float = 10.0  # clip of each axis, N (appendix B)
+    time_limit: float = 20.0  # of an episode, s (sec. 4)
     late, gain, surface = 0, 1.0, 2.0  # see Other
 
     def __post_init__(self):
@@ -82,6 +82,8 @@ class World:
                 raise ValueError(f"--{name.replace('_', '-')} {low} {high}: a range, the least first{upper}")
         if not self.max_force > 0:
             raise ValueError(f"--max-force {self.max_force}: above 0")
+        if not 1 <= self.time_limit <= 3600:
+            raise ValueError(f"--time-limit {self.time_limit}: in s, 1 to 3600")
         if not self.occlusion_start <= 1:
             raise ValueError(f"--occlusion-start {self.occlusion_start}: at most 1")
 
@@ -90,6 +92,11 @@ class World:
         """The world that a record's settings name; what they do not know is what the code did then."""
         past = {known.name: settings.get(known.name, known.metadata.get("before", known.default)) for known in fields(cls)}
         return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in past.items()})
+
+    @property
+    def horizon(self):
+        """Steps of an episode."""
+        return round(RATE * self.time_limit)
 
     @property
     def dynamics(self):

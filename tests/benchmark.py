@@ -97,7 +97,7 @@ def estimate(preset, most, batches=30):
     """Mini-batches of 03, one epoch of them, the validation left out."""
     stage = importlib.import_module("03_train_estimator")
     cfg = stage.Config(**stage.PRESETS[preset] | dict(method="ours", epochs=1, validation=1))
-    offsets = np.arange(batches * cfg.sequences + 1) * task.HORIZON
+    offsets = np.arange(batches * cfg.sequences + 1) * task.World().horizon
     data = rng.uniform(-0.1, 0.1, (offsets[-1], 7)).astype(np.float32), offsets
     with tempfile.TemporaryDirectory() as folder:
         run = SimpleNamespace(dir=Path(folder) / "seed0", log=lambda **row: None, save_resume=lambda state: None,
@@ -105,7 +105,7 @@ def estimate(preset, most, batches=30):
         begin = time.perf_counter()
         stage.train(run, cfg, data, data, torch.device("cpu"))
         per_s = batches / (time.perf_counter() - begin)
-    steps = per_s * cfg.sequences * task.HORIZON
+    steps = per_s * cfg.sequences * task.World().horizon
     line(f"03, {preset}, steps of trajectories, {HOW}", steps, more=f": {per_s:.1f} mini-batches/s" + share(
         steps, most, networks.Estimator(cfg.sizes)))
 

@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from common import calibration, task
+from common import calibration
 
 T, B = 200, 400
 
@@ -98,15 +98,15 @@ def test_a_sigma_that_rises_before_the_end_foresees_it():
     rng = np.random.default_rng(0)
     length = rng.integers(60, 290, 300)
     success = rng.random(300) < 0.5
-    variance = np.full((task.HORIZON, 300, 4), 1e-4) * rng.uniform(0.9, 1.1, (task.HORIZON, 300, 1))
+    variance = np.full((300, 300, 4), 1e-4) * rng.uniform(0.9, 1.1, (300, 300, 1))
     for i in np.flatnonzero(~success):
         variance[max(0, length[i] - 30):length[i], i] *= 9
-    courses = calibration.course(variance, length, success)
+    courses = calibration.course(variance, length, success, 300)
     seen = calibration.foreseen(courses)
     assert seen["episodes"] == 300 and seen["left"] == (~success).sum()
     assert seen["sigma"]["mean"] > 0.95 and seen["sigma"]["low"] <= seen["sigma"]["mean"] <= seen["sigma"]["high"]
     assert seen["rise"]["mean"] > 0.65 and seen["time"]["mean"] < 0.75
-    timed_out = calibration.course(variance, np.full(300, task.HORIZON), np.zeros(300, bool))
+    timed_out = calibration.course(variance, np.full(300, 300), np.zeros(300, bool), 300)
     assert calibration.foreseen(timed_out) is None
 
 

@@ -103,7 +103,8 @@ def test_observations_clip_at_the_worlds_force():
     ({"mass": (2.0, 1.0)}, "--mass 2.0 1.0"), ({"mass": (0.0, 1.0)}, "--mass"), ({"support": (0.5, 0.2)}, "--support"),
     ({"mu_dynamic": (-0.1, 0.2)}, "--mu-dynamic"), ({"support_offset": (0.1, 0.0)}, "--support-offset"),
     ({"support": (0.0, 2.0)}, "up to 1"), ({"support_offset": (0.0, 0.06)}, "up to 0.05"),
-    ({"restitution": (0.0, 2.0)}, "up to 1"), ({"occlusion_start": 2.0}, "at most 1")])
+    ({"restitution": (0.0, 2.0)}, "up to 1"), ({"occlusion_start": 2.0}, "at most 1"),
+    ({"time_limit": 0.5}, "--time-limit 0.5: in s, 1 to 3600"), ({"time_limit": np.nan}, "--time-limit nan")])
 def test_no_such_world(changes, words):
     with pytest.raises(ValueError, match=words):
         World(**changes)
@@ -198,11 +199,13 @@ def test_tolerance_is_an_aid():
     assert env.step([[REST, REST]])[4]["success"][0]
 
 
-def test_time_limit_truncates():
-    env = start(2, box=[0.1, 0, 0], pusher=[-0.2, 0])
-    for t in range(300):
+@pytest.mark.parametrize("seconds", [20.0, 3.0])
+def test_time_limit_truncates(seconds):
+    env = PushVectorEnv(2, world=World(time_limit=seconds))
+    env.reset(options=MIDDLE | {"box": [0.1, 0, 0], "pusher": [-0.2, 0]})
+    for t in range(int(15 * seconds)):
         _, _, terminated, truncated, _ = env.step(np.full((2, 2), REST))
-        assert not terminated.any() and (truncated == (t == 299)).all()
+        assert not terminated.any() and (truncated == (t == 15 * seconds - 1)).all()
     assert not env.step(np.full((2, 2), REST))[3].any()  # the clock starts anew
 
 

@@ -20,9 +20,9 @@ from common.task import World
 evaluate = importlib.import_module("05_evaluate")
 
 
-def players(num_envs=6, seed=0):
+def players(num_envs=6, seed=0, world=World(time_limit=2.0)):
     """Players with small untrained nets instead of a run's."""
-    play = evaluate.Players(SimpleNamespace(num_envs=num_envs, seed=seed, passes=2, particles=20), {}, torch.device("cpu"))
+    play = evaluate.Players(SimpleNamespace(num_envs=num_envs, seed=seed, passes=2, particles=20), {}, torch.device("cpu"), world)
     torch.manual_seed(0)
     nets = {size: networks.policy(size, (8, 8, 8)) for size in (8, 9, 12)}
     estimator = networks.Estimator((8, 8, 8))
@@ -30,11 +30,6 @@ def players(num_envs=6, seed=0):
     play.policy = lambda method, seed: nets[inputs[stacks.METHODS[method].reads]]
     play.estimator = lambda kind: estimator if kind else None
     return play
-
-
-@pytest.fixture
-def short(monkeypatch):
-    monkeypatch.setattr(task, "HORIZON", 30)
 
 
 def first_rows(play, method, chunk=0, **kw):
@@ -68,7 +63,7 @@ def test_paired_difference_is_narrower_than_the_independent_one():
     assert statistics.paired(a, a) == {"mean": 0, "low": 0, "high": 0}
 
 
-def test_every_method_meets_the_same_episodes(short):
+def test_every_method_meets_the_same_episodes():
     """Starts, dynamics, bias, noise and xi of the list are the same, whatever the policy does."""
     play = players()
     rows, dynamics = first_rows(play, "est_uncertainty")
@@ -85,7 +80,7 @@ def test_every_method_meets_the_same_episodes(short):
     assert not np.array_equal(first_rows(players(seed=1), "est")[0][0]["state"], first["state"])
 
 
-def test_the_occlusion_changes_nothing_but_what_is_hidden(short):
+def test_the_occlusion_changes_nothing_but_what_is_hidden():
     play = players()
     none, full = (first_rows(play, "end_to_end", occlusion=seconds)[0] for seconds in (0.0, math.inf))
     none, full = (np.stack([row["o"] for row in rows]) for rows in (none, full))
@@ -97,7 +92,7 @@ def test_the_occlusion_changes_nothing_but_what_is_hidden(short):
     assert hidden.any() and not (np.diff(hidden[:, hidden.any(0)], axis=0)[:8] < 0).any()
 
 
-def test_an_episode_can_be_played_again(short):
+def test_an_episode_can_be_played_again():
     play = players()
     m = evaluate.Measurement("est_uncertainty", 10)
     values = play.measure(m, 0) + play.measure(m, 1)
@@ -109,7 +104,7 @@ def test_an_episode_can_be_played_again(short):
     np.testing.assert_array_equal(again["state"], play.episode(m, 7)["state"])
 
 
-def test_a_measurement_is_the_same_whatever_was_measured_before_it(short, tmp_path):
+def test_a_measurement_is_the_same_whatever_was_measured_before_it(tmp_path):
     """Reading a net draws nothing: a rerun that measures one thing alone gives what the whole run gave."""
     paths = {("est_uncertainty", 0): tmp_path / "policy.safetensors", "ours": [tmp_path / "estimator.safetensors"]}
     weights.save(paths["est_uncertainty", 0], networks.policy(12, (8, 8, 8)))
@@ -119,7 +114,7 @@ def test_a_measurement_is_the_same_whatever_was_measured_before_it(short, tmp_pa
     np.testing.assert_array_equal(*beliefs)
 
 
-def test_recorded_keeps_the_end_of_an_episode(short):
+def test_recorded_keeps_the_end_of_an_episode():
     success, length, env = players().chunk(evaluate.Measurement("est", 6, occlusion=0.0), 0)
     for world, n in enumerate(length):
         episode = env.episode(world, n)
@@ -134,7 +129,7 @@ def made_up(seeds=1, methods=stacks.METHODS):
     """Values of every measurement, as 05 stores them."""
     rng = np.random.default_rng(0)
     row = {"trans_mean_l2_mm": 4.0, "trans_rmse_mm": 3.5, "rot_mean_abs_deg": 2.0, "rot_rmse_deg": 3.0}
-    steps = task.HORIZON
+    steps = World().horizon
     hidden = np.arange(steps)[:, None] > 20 + np.zeros(9)
     tallies = calibration.tally(*rng.uniform(0.1, 0.9, (3, steps, 9, 4)), hidden, np.ones((steps, 9)))
     sure = calibration.summary(tallies)
@@ -146,7 +141,7 @@ def made_up(seeds=1, methods=stacks.METHODS):
         done[name] = rng.integers(0, 2, m.episodes).tolist()
         if m.errors:
             length, won = rng.integers(10, steps, m.episodes), rng.random(m.episodes) < 0.5
-            courses = calibration.course(np.ones((steps, m.episodes, 4)), length, won)
+            courses = calibration.course(np.ones((steps, m.episodes, 4)), length, won, steps)
             errors = {part: [9, *rng.uniform(0, 1, 4)] for part in ("all", "seen", "occluded")}
             done[name] = [errors | {"calibration": tallies[i % 9].tolist(), "course": courses[i].tolist()}
                           for i in range(m.episodes)]
@@ -171,9 +166,9 @@ def test_results_have_the_published_layout():
     assert all(set(row) == {"priv_on_state", "est_uncertainty"} for row in results["starts"].values())
 
 
-def test_errors_in_the_loop_are_those_of_the_beliefs_before_the_actions(short):
+def test_errors_in_the_loop_are_those_of_the_beliefs_before_the_actions():
     success, length, env = players().chunk(evaluate.Measurement("est_uncertainty", 6), 0)
-    told = trajectories.in_the_loop(env.rows, length, success, [2.0] * 4)
+    told = trajectories.in_the_loop(env.rows, length, success, 30, [2.0] * 4)
     for world, n in enumerate(length):
         episode = env.episode(world, n)
         state, belief = episode["state"][:n], episode["belief"][:n]
@@ -187,7 +182,7 @@ def test_errors_in_the_loop_are_those_of_the_beliefs_before_the_actions(short):
         assert [sums["within"][0, i:i + 2].tolist() for i in (6, 15)] == within
         assert scaled["ratios"] == pytest.approx(sums["ratios"] / 4)
         assert told[world]["course"][0] == n and told[world]["course"][1] == (0 if success[world] else pytest.approx(
-            np.nan if n == task.HORIZON else 1, nan_ok=True))
+            np.nan if n == 30 else 1, nan_ok=True))
 
 
 def test_a_table_of_errors_in_the_loop():
@@ -214,8 +209,9 @@ def test_other_worlds_differ_in_one_thing():
     assert "box=+2cm_wide" not in measurements.other_worlds(task.World(box=(0.2, 0.21, 0.07)))  # no room
 
 
-def test_another_world_is_played(short):
-    play, rows = players(), measurements.other_worlds(task.World())
+def test_another_world_is_played():
+    play = players()
+    rows = measurements.other_worlds(play.world)
     base = first_rows(play, "est")[1]
     for row in ("mass=1-1.5", "c=0.078", "surface=4", "support_offset=8mm"):
         env = play.chunk(measurements.Measurement("est", 6, world=rows[row]), 0)[2].unwrapped
@@ -293,7 +289,7 @@ def shape(path):
     return cv2.imread(str(path)).shape
 
 
-def test_every_figure_is_drawn_with_whatever_runs_there_are(tmp_path, short):
+def test_every_figure_is_drawn_with_whatever_runs_there_are(tmp_path):
     study, play = tmp_path / "study", players()
     for run in ("03_train_estimator/ours", "03_train_estimator/mse", "04_train_policy/behavior_cloning"):
         write_metrics(study / run / "seed0", [dict(epoch=i, train_loss=1, validation_loss=2 / i) for i in (1, 2, 3)])
@@ -326,7 +322,7 @@ def test_every_figure_is_drawn_with_whatever_runs_there_are(tmp_path, short):
     assert not list(tmp_path.rglob(".*"))  # nothing half-written
 
 
-def test_the_film_shows_every_step(tmp_path, short):
+def test_the_film_shows_every_step(tmp_path):
     _, length, env = players().chunk(evaluate.Measurement("est_uncertainty", 6, occlusion=1.0), 0)
     episode = env.episode(length.argmax(), length.max())
     film.write(episode, tmp_path / "film.mp4", tmp_path / "film.gif")

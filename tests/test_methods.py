@@ -13,8 +13,7 @@ from common import runs, stacks
 ROOT = Path(__file__).parent.parent
 ENTRY = """if True:
     import runpy, sys
-    from common import stacks, task
-    task.HORIZON = 20  # for time
+    from common import stacks
     stacks.METHODS["mine"] = stacks.Method("my own", "s_hat, sigma", "likelihood", "rl")
     sys.argv[:] = sys.argv[1:]
     runpy.run_path(sys.argv[0], run_name="__main__")

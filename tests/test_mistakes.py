@@ -6,7 +6,7 @@ import sys
 
 import pytest
 import torch
-from conftest import SCRIPTS, is_mistake, start
+from conftest import SCRIPTS, is_mistake
 from test_stages import OUTPUTS
 
 from common import command, files, ranks
@@ -119,10 +119,9 @@ def test_every_preset_is_a_config(script):
         assert command.parse(module.Config, module.PRESETS, module.__doc__, [preset]).preset == preset
 
 
-def test_mistakes_on_the_command_line_are_one_line(tmp_path):
+def test_mistakes_on_the_command_line_are_one_line(tmp_path, call):
     for field, value, words in (("--lerning-rate", "1", "--help"), ("--updates", "many", "--updates"),
                                 ("--checkpoints", "1", "say 2 to 7"), ("--mass", "2 1", "the least first"),
                                 ("--box", "0.3 0.2 0.07", "no room to start"), ("--starts", "here", "--starts")):
-        process = start(tmp_path / "runs", "01_train_privileged", field, *value.split())
-        assert is_mistake(*process.communicate(), process.returncode, field, words)
+        assert is_mistake(*call(tmp_path / "runs", "01_train_privileged", field, *value.split()), field, words)
     assert not (tmp_path / "runs").exists()

@@ -306,7 +306,7 @@ def test_threads_change_no_bit():
         env.near_share = 1.0
         env.reset(seed=3)
         states = []
-        for _ in range(task.HORIZON + 5):
+        for _ in range(World().horizon + 5):
             toward = np.where(env.box[:, :2] > env.pusher, 3, -3)
             states.append(env.step(np.clip(5 + toward + rng.integers(-2, 3, (50, 2)), 0, 10))[4]["state"])
         return np.stack(states)

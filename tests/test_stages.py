@@ -17,6 +17,7 @@ from common.env import PushVectorEnv
 from common.task import World
 
 ROOT = Path(__file__).parent.parent
+SMOKE = importlib.import_module(SCRIPTS[0]).PRESETS["smoke"]["world"]
 SETS = {"train": 48, "validation": 12, "test": 12, "teacher_train": 48, "teacher_validation": 12}
 ESTIMATORS = {"ours", "likelihood", "mse"}
 POLICIES = {"est_uncertainty", "est", "est_mse", "end_to_end", "behavior_cloning"}
@@ -81,7 +82,7 @@ def test_every_update_is_logged(study, folder, updates):
     values = {name: np.array([float(row[name]) for row in rows]) for name in first if name != "success"}
     assert all(np.isfinite(values[name]).all() for name in ("tolerance", *columns))
     assert np.isfinite(values["train_return"]).any()  # nan where no episode ended
-    for name, low, high in (("train_success", 0, 1), ("train_length", 1, task.HORIZON), ("clip_fraction", 0, 1), ("kl", 0, 1),
+    for name, low, high in (("train_success", 0, 1), ("train_length", 1, SMOKE.horizon), ("clip_fraction", 0, 1), ("kl", 0, 1),
                             ("entropy", 0, 2 * np.log(11) + 1e-4), ("explained", -99, 1), ("lr", 1e-5, 0.1), ("tolerance", 1, 4)):
         assert np.nanmin(values[name]) >= low and np.nanmax(values[name]) <= high, name
     assert (values["steps_per_s"] > 0).all() and (values["value_loss"] > 0).all()
@@ -92,13 +93,13 @@ def test_trajectories_are_whole_episodes_of_the_study(study, name):
     folder = study / "smoke" / "02_collect" / "seed0"
     states, offsets = trajectories.load(*(folder / file for file in trajectories.files(name)))
     lengths, first, last = np.diff(offsets), states[offsets[:-1]], states[offsets[1:] - 1]
-    assert len(lengths) == SETS[name] and lengths.min() >= 1 and lengths.max() <= task.HORIZON
+    assert len(lengths) == SETS[name] and lengths.min() >= 1 and lengths.max() <= SMOKE.horizon
     assert states.dtype == np.float32 and np.isfinite(states).all()
     assert (np.abs(first[:, :2]) <= World().centre_range(first[:, 2]) + 1e-6).all() and not first[:, 5:].any()
     assert not task.outside(states[:, :3], states[:, 3:5]).any() and not task.reached(states[:, :3]).any()
     within = np.diff(np.repeat(np.arange(len(lengths)), lengths)) == 0
     assert (np.abs(np.diff(states[:, 3:5], axis=0))[within] <= task.MAX_SPEED / task.RATE + 1e-6).all()
-    ended = lengths < task.HORIZON  # one step from the edge, or from the target
+    ended = lengths < SMOKE.horizon  # one step from the edge, or from the target
     edge = np.minimum(task.HALF - np.abs(last[:, :2]), task.HALF - np.abs(last[:, 3:5])).min(1)
     assert ((edge < 0.006) | (np.linalg.norm(last[:, :2], axis=1) < 0.016))[ended].all()
 
@@ -113,7 +114,7 @@ def test_every_checkpoint_plays_as_many_episodes(study):
 def test_a_drifting_player_sees_the_box_off_its_pose_in_the_last_worlds():
     env = collection.Drifting(PushVectorEnv(600), 400)
     errors, obs = [], env.reset(seed=3)[0]
-    for _ in range(task.HORIZON - 1):  # no world ends before
+    for _ in range(World().horizon - 1):  # no world ends before
         errors.append(task.unscale_pose(obs[:, :4]) - env.unwrapped.box)
         assert (obs[:, 4:] == task.scale(env.unwrapped.state)[:, 4:]).all()
         obs = env.step(np.full((600, 2), 5))[0]
@@ -174,14 +175,14 @@ def test_results_have_every_number(study):
 
 def test_other_worlds_are_played_by_every_policy_that_estimates(copy, call, monkeypatch):
     out = copy(4)
-    monkeypatch.setattr(task, "HORIZON", 20)  # for time
+    monkeypatch.setattr(World, "horizon", 15)  # for time
     assert call(out, "05_evaluate", "--other-episodes", "2")[2] == 0
     results = json.loads((out / "smoke/05_evaluate/seed0/results.json").read_text())
     estimating = {"est_uncertainty", "est", "est_mse", "priv_on_estimate"}
     assert results["other_worlds"].keys() == {
         "c=0.042", "c=0.060", "c=0.078", "support_offset=8mm", "mass=1-1.5", "mass=5-6", "mu=0.05-0.1", "mu=0.3-0.6", "box=-2cm",
         "box=+2cm", "box=+2cm_wide", "noise=2x", "bias=2x", "force=0.7x", "force=1.3x", "late=1", "late=2", "surface=1.5",
-        "surface=4"}
+        "surface=4", "time=30s"}
     for row, rates in results["other_worlds"].items():
         sensing = row.partition("=")[0] in ("noise", "bias", "force", "late")
         assert rates.keys() == (estimating if sensing else estimating | {"priv_on_state"})

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from common import draw, task
+from common import draw
 from common.files import UserError
 from common.robot import views
 
@@ -83,7 +83,7 @@ class Page(ThreadingHTTPServer):
             super().__init__(("127.0.0.1", port, *more), Request)
         except (OSError, OverflowError, TypeError) as error:
             raise UserError(f"--view {port}: this port cannot be had ({error}); give another") from None
-        self.fresh, self.history = threading.Event(), deque(maxlen=task.HORIZON)
+        self.fresh, self.history = threading.Event(), deque(maxlen=views.SPAN)
         self.pipe, far = multiprocessing.Pipe()
         self.painter = subprocess.Popen(  # a session of its own: Ctrl-C is for the program alone
             [sys.executable, "-m", "common.robot.page", str(far.fileno())], cwd=Path(__file__).parents[2],

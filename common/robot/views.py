@@ -7,6 +7,7 @@ from common.robot import scene
 
 FOUND = (60, 220, 60)
 WIDTH, TOP = 960, 360  # pixels of a composite: scene and camera above, as high as TOP; below, from above and the curves
+SPAN = 20 * task.RATE  # ticks that the curves show
 CURVES = (("force", 15.0, "N"), ("sigma", 30.0, "mm"), ("age of the sight", 10.0, "s"))  # with the top of each scale
 
 
@@ -45,7 +46,7 @@ def composite(row, tick, history):
     half, strip = WIDTH // 2, WIDTH // 12
     outside, seen, above = (cv2.resize(view, (half, height)) for view, height in zip(panels(row, tick), (TOP, TOP, half // 2)))
     plot, values = np.full((half // 2, half, 3), 255, np.uint8), np.array(history).reshape(-1, len(CURVES))
-    x = np.linspace(0, half, task.HORIZON)[:len(values)]
+    x = np.linspace(0, half, SPAN)[:len(values)]
     for i, (name, top, unit) in enumerate(CURVES):
         bottom = (i + 1) * strip - 1
         y = bottom - 3 - (strip - 8) * np.clip(values[:, i] / top, 0, 1)
