@@ -36,11 +36,23 @@ class Believed(EpisodeWrapper):
         if len(worlds) == self.num_envs:
             self.hidden = hidden
         else:
-            for all_worlds, new in zip(self.hidden, hidden):
-                all_worlds[:, worlds] = new.to(all_worlds.dtype)
+            self.remember(worlds, hidden)
         infos.setdefault("belief", belief)
         return belief[:, :self.size]
 
     def observe(self, obs, infos):
-        infos["belief"], self.hidden = believe(self.estimator, obs, self.hidden, self.passes)
-        return infos["belief"][:, :self.size]
+        rows = self.unwrapped.rows
+        if len(rows) == self.num_envs:
+            self.belief, self.hidden = believe(self.estimator, obs, self.hidden, self.passes)
+        else:
+            hidden = tuple(h[:, rows] for h in self.hidden)
+            self.belief = self.belief.copy()  # the last one stays in the infos of its step
+            self.belief[rows], hidden = believe(self.estimator, obs[rows], hidden, self.passes)
+            self.remember(rows, hidden)
+        infos["belief"] = self.belief
+        return self.belief[:, :self.size]
+
+    def remember(self, worlds, hidden):
+        """Puts the hidden state of `worlds` (k,) in its place."""
+        for all_worlds, new in zip(self.hidden, hidden):
+            all_worlds[:, worlds] = new.to(all_worlds.dtype)

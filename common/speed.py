@@ -5,6 +5,7 @@ import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional as F
@@ -108,6 +109,12 @@ def passes(head, z, count):
 
     outputs = (map if small or z.device.type != "cpu" else side_by_side)(several, counts, seeds)
     return [None if parts[0] is None else torch.cat(parts) for parts in zip(*outputs)]
+
+
+def fewer(wanted):
+    """Indices into (N,) bool of what is wanted, with some others to make a multiple of WIDTH; all where that spares little."""
+    few = np.argsort(~wanted, kind="stable")[:-(-wanted.sum() // WIDTH) * WIDTH]
+    return np.sort(few) if len(few) <= 0.9 * len(wanted) else np.arange(len(wanted))
 
 
 def halves(batch):

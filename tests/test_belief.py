@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from common import networks
+from common import episodes, film, networks, speed, stacks
 from common.belief import Believed
 from common.env import PushVectorEnv
 from common.observation import Observed
@@ -25,7 +25,7 @@ def play(env, steps=STEPS):
     return out
 
 
-def episodes(played, world):
+def split(played, world):
     """The observations of each episode of a world, from its first to its final_obs."""
     rows, whole = [played[0][0][world]], []
     for o, infos in played[1:]:
@@ -41,7 +41,7 @@ def test_each_episode_is_estimated_as_if_alone(estimator, float32):
     believed = play(Believed(Observed(PushVectorEnv(WORLDS)), estimator, passes=3, sigma=True))
     ends = 0
     for world in range(WORLDS):
-        pairs = list(zip(episodes(seen, world), episodes(believed, world), strict=True))
+        pairs = list(zip(split(seen, world), split(believed, world), strict=True))
         ends += len(pairs) - 1
         for o, s_hat in pairs:
             q, log_var, _ = estimator(torch.as_tensor(o)[:, None])
@@ -77,3 +77,33 @@ def test_a_reset_forgets(estimator):
     for _ in range(5):
         env.step(np.full((4, 2), 7))
     assert (env.reset(seed=5)[0] == first).all()
+
+
+def test_leaving_out_the_worlds_that_nobody_reads_changes_no_episode(estimator, float32, monkeypatch):
+    policy = networks.policy(12, (8, 8, 8))
+    policy.head[-1].bias.data[10] = 9.0  # to the right, and out of the workspace where that is near
+    widths, believe = [], estimator.predict
+    monkeypatch.setattr(estimator, "predict", lambda o, *more: widths.append(o.shape[1]) or believe(o, *more))
+
+    def played():
+        env = film.Recorded(stacks.make(stacks.METHODS["est_uncertainty"], 100, estimator))
+        return *episodes.play(env, policy, seed=4), env
+
+    success, length, env = played()
+    assert length.min() < 50 and length.max() > 150 and widths.count(100) < 110 and min(widths[-20:]) <= 48
+    monkeypatch.setattr(episodes, "fewer", lambda wanted: np.arange(len(wanted)))
+    alike, as_long, whole = played()
+    assert (success == alike).all() and (length == as_long).all()
+    for world, n in enumerate(length):
+        one, other = (each.episode(world, n) for each in (env, whole))
+        for name in one:
+            np.testing.assert_allclose(one[name], other[name], atol=1e-5)
+
+
+def test_what_is_left_is_a_multiple_of_the_width():
+    wanted = np.zeros(100, bool)
+    wanted[[3, 50, 99]] = True
+    kept = speed.fewer(wanted)
+    assert len(kept) == speed.WIDTH and (np.diff(kept) > 0).all() and {3, 50, 99} <= {*kept}
+    wanted[:90] = True
+    assert (speed.fewer(wanted) == np.arange(100)).all()
