@@ -23,7 +23,8 @@ def believe(estimator, o, hidden, passes):
 class Believed(EpisodeWrapper):
     """An Observed env, Mirrored, whose box pose is the estimator's: observations s_hat (N, 8), with `sigma` all of `believe`.
 
-    Infos: `belief` (N, 12), s_hat and sigma of this step in the frame of the env below; where an episode ended, of its end.
+    Infos: `belief` (N, 12), s_hat and sigma of this step in the frame of the env below; where an episode ended, of its end;
+    of a world that is not watched, an older one.
     """
 
     def __init__(self, env, estimator, passes, sigma):
@@ -41,14 +42,14 @@ class Believed(EpisodeWrapper):
         return belief[:, :self.size]
 
     def observe(self, obs, infos):
-        rows = self.unwrapped.rows
-        if len(rows) == self.num_envs:
+        watched = self.unwrapped.watched
+        if len(watched) == self.num_envs:
             self.belief, self.hidden = believe(self.estimator, obs, self.hidden, self.passes)
         else:
-            hidden = tuple(h[:, rows] for h in self.hidden)
+            hidden = tuple(h[:, watched] for h in self.hidden)
             self.belief = self.belief.copy()  # the last one stays in the infos of its step
-            self.belief[rows], hidden = believe(self.estimator, obs[rows], hidden, self.passes)
-            self.remember(rows, hidden)
+            self.belief[watched], hidden = believe(self.estimator, obs[watched], hidden, self.passes)
+            self.remember(watched, hidden)
         infos["belief"] = self.belief
         return self.belief[:, :self.size]
 

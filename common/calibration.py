@@ -120,8 +120,8 @@ def area(score, label, weight):
 
 def foreseen(courses):
     """How well sigma tells, each second of an episode, whether it leaves the workspace within 2 s, from `course`'s rows: areas
-    under ROC curves of sigma, its rise in the last second, and elapsed time alone, with intervals over episodes. Time-outs left out;
-    none if there is nothing to tell apart.
+    under ROC curves of sigma, its rise in the last second, and elapsed time alone, with intervals over episodes. Time-outs
+    left out; none if there is nothing to tell apart.
     """
     courses = np.asarray(courses, float)
     courses = courses[np.isfinite(courses[:, 1])]

@@ -27,7 +27,8 @@ class PushVectorEnv(gym.vector.VectorEnv):
     simulator.Worlds; they change no bit.
 
     Attributes:
-        rows: the worlds whose observations somebody reads, all from a reset on: a wrapper may spare its work for the others.
+        watched: the worlds whose observations are still read. episodes.play leaves out what is done, a reset makes it all again;
+        a wrapper need not work for the others.
         worlds: simulator.Worlds, the physics; its box, pusher, force, dynamics (here the drawn ones) and state are here too.
         tolerance, near_share: a curriculum's (training.py; 1 and 0 are none): the factor on the success tolerance, and the
         share of episodes that start with the box at a random fraction of its way from the target and the pusher beside it.
@@ -100,8 +101,8 @@ class PushVectorEnv(gym.vector.VectorEnv):
         Raises ValueError: an unknown option, or one of a wrong shape or value.
         """
         super().reset(seed=seed)
-        self.rows = np.arange(self.num_envs)
-        self._start(self.rows, **self._given(options))
+        self.watched = np.arange(self.num_envs)
+        self._start(self.watched, **self._given(options))
         state = self.state
         return self.scaled(state), {"state": state}
 

@@ -13,7 +13,10 @@ HELD, ESTIMATE, FORCE, TEXT = (230, 159, 0), (0, 158, 115), (0, 0, 0), (60, 60, 
 
 
 class Recorded(EpisodeWrapper):
-    """The topmost wrapper of a stack: `rows` of each step's `state` (N, 7) and, if there are, `o` (N, 9), `belief` (N, 12)."""
+    """The topmost wrapper of a stack: `rows` of each step's `state` (N, 7) and, if there are, `o` (N, 9), `belief` (N, 12).
+
+    They go on after a world's first episode, which is all that `episode` gives.
+    """
 
     def reset(self, *, seed=None, options=None):
         self.rows = []

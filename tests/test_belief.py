@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from common import episodes, film, networks, speed, stacks
+from common import episodes, film, networks, stacks
 from common.belief import Believed
 from common.env import PushVectorEnv
 from common.observation import Observed
@@ -98,12 +98,3 @@ def test_leaving_out_the_worlds_that_nobody_reads_changes_no_episode(estimator, 
         one, other = (each.episode(world, n) for each in (env, whole))
         for name in one:
             np.testing.assert_allclose(one[name], other[name], atol=1e-5)
-
-
-def test_what_is_left_is_a_multiple_of_the_width():
-    wanted = np.zeros(100, bool)
-    wanted[[3, 50, 99]] = True
-    kept = speed.fewer(wanted)
-    assert len(kept) == speed.WIDTH and (np.diff(kept) > 0).all() and {3, 50, 99} <= {*kept}
-    wanted[:90] = True
-    assert (speed.fewer(wanted) == np.arange(100)).all()

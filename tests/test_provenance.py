@@ -138,7 +138,7 @@ def test_inputs_of_two_worlds_are_one_line(config, tmp_path):
 def test_a_run_of_before_the_world_is_known_by_its_world(config, tmp_path):
     cfg = Worldly(preset="quick", out=tmp_path / "runs")
     path = make(cfg, "01_a", 1)
-    record(path, starts=None, support=None, support_offset=None)
+    record(path, starts=None, support=None, support_offset=None, time_limit=None)
     old = runs.Run(config(), "02_b", {"a": path}).world
     assert old == BEFORE and old.dynamics["limit_surface_c"] == (0.060, 0.060)
     with pytest.raises(UserError, match="starts inner -> box, support "):

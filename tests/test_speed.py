@@ -5,6 +5,7 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -310,3 +311,12 @@ def test_what_is_made_ahead_comes_in_order_and_one_early():
     assert made == [0, 1, 2, 3, 4] and list(speed.ahead(abs, [])) == []
     with pytest.raises(ZeroDivisionError):
         list(speed.ahead(lambda x: 1 / x, [1, 0]))
+
+
+def test_what_is_left_is_a_multiple_of_the_width():
+    wanted = np.zeros(100, bool)
+    wanted[[3, 50, 99]] = True
+    kept = speed.fewer(wanted)
+    assert len(kept) == speed.WIDTH and (np.diff(kept) > 0).all() and {3, 50, 99} <= {*kept}
+    wanted[:90] = True
+    assert (speed.fewer(wanted) == np.arange(100)).all()

@@ -7,7 +7,7 @@ from common.robot import scene
 
 FOUND = (60, 220, 60)
 WIDTH, TOP = 960, 360  # pixels of a composite: scene and camera above, as high as TOP; below, from above and the curves
-SPAN = 20 * task.RATE  # ticks that the curves show
+SPAN = 20 * task.RATE  # the newest ticks, which the curves show
 CURVES = (("force", 15.0, "N"), ("sigma", 30.0, "mm"), ("age of the sight", 10.0, "s"))  # with the top of each scale
 
 
@@ -42,7 +42,7 @@ def curves_of(row):
 
 
 def composite(row, tick, history):
-    """RGB image (600, WIDTH, 3) of a tick: its three panels and, over the run, its curves; history is a list of curves_of."""
+    """RGB image (600, WIDTH, 3) of a tick: its three panels, and the curves of `history`, a list of curves_of."""
     half, strip = WIDTH // 2, WIDTH // 12
     outside, seen, above = (cv2.resize(view, (half, height)) for view, height in zip(panels(row, tick), (TOP, TOP, half // 2)))
     plot, values = np.full((half // 2, half, 3), 255, np.uint8), np.array(history).reshape(-1, len(CURVES))
