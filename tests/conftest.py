@@ -4,10 +4,12 @@ import importlib
 import shutil
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import torch
+from tyro.conf import OmitArgPrefixes
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
@@ -15,6 +17,7 @@ from six_joints import SIX  # noqa: E402
 
 from common import command, networks, runs, speed, weights  # noqa: E402
 from common.robot.iiwa import IIWA  # noqa: E402
+from common.task import World  # noqa: E402
 
 speed.set_up()
 SCRIPTS = ["01_train_privileged", "02_collect", "03_train_estimator", "04_train_policy", "05_evaluate", "06_robot"]
@@ -95,12 +98,17 @@ def model(request):
     return request.param
 
 
+@dataclass
+class Short(command.Stage):
+    world: OmitArgPrefixes[World] = World(time_limit=11.0)  # a hand that covers the tags for 5 s has left before
+
+
 @pytest.fixture(scope="module")
 def nets(tmp_path_factory):
     """A root with an untrained estimator and policy, as stages 03 and 04 leave them."""
     torch.manual_seed(2)  # some untrained nets drive the box to where its film cannot be tracked anew
     out = tmp_path_factory.mktemp("robot") / "runs"
-    cfg = command.Stage(preset="smoke", out=out)
+    cfg = Short(preset="smoke", out=out)
     for stage, method, name, net in (
             ("03_train_estimator", "ours", "estimator.safetensors", networks.Estimator((16, 16, 16))),
             ("04_train_policy", "est_uncertainty", "policy.safetensors", networks.policy(12, (16, 16, 16)))):
