@@ -1,4 +1,3 @@
-import importlib
 from dataclasses import replace
 
 import gymnasium as gym
@@ -9,7 +8,6 @@ from gymnasium.vector import AutoresetMode
 from torch import nn
 
 from common import networks, ppo, speed, task
-from common.env import PushVectorEnv
 
 HP = ppo.Hyperparameters(minibatch=10**6, epochs=1)
 bfloat16 = pytest.mark.skipif(not torch.cpu._is_avx512_bf16_supported(), reason="this machine does not compute in bfloat16")
@@ -327,20 +325,6 @@ def test_gradients_are_clipped_apart():
                       for net, old in zip(both, before)])
     torch.testing.assert_close(moved[0][0], moved[1][0])
     assert [step.norm().item() for pair in moved for step in pair] == pytest.approx([0.01] * 4, rel=1e-3)
-
-
-def test_near_starts_fade_and_held_out_episodes_have_none(monkeypatch, tmp_path):
-    stage, shares, reset = importlib.import_module("01_train_privileged"), [], PushVectorEnv.reset
-
-    def record(env, **kw):
-        shares.append((env.num_envs, env.near_share))
-        return reset(env, **kw)
-
-    monkeypatch.setattr(PushVectorEnv, "reset", record)
-    changes = dict(near_share=0.6, updates=3, resume_every=1)
-    stage.main(stage.Config(preset="smoke", out=tmp_path, device="cpu", **stage.PRESETS["smoke"] | changes))
-    assert [share for worlds, share in shares if worlds == 32] == pytest.approx([0.6, 0.4, 0.2])
-    assert {share for worlds, share in shares if worlds == 16} == {0}
 
 
 # Learning

@@ -1,3 +1,4 @@
+import importlib
 import math
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 import torch
 
 from common import training
+from common.env import PushVectorEnv
 
 
 @pytest.mark.parametrize("tolerance, ended, successes, wanted", [
@@ -41,3 +43,17 @@ def test_episodes_are_counted_across_rollouts():
     assert running.tolist() == [[5 + 6 + 7, 70], [3, 1]]
     *_, fourth = training.ended_episodes(batch([[8.0, 80.0]], [[1, 0]], 0), running)
     assert fourth == {"train_success": 0, "train_return": 5 + 6 + 7 + 8, "train_length": 4}
+
+
+def test_near_starts_fade_and_held_out_episodes_have_none(monkeypatch, tmp_path):
+    stage, shares, reset = importlib.import_module("01_train_privileged"), [], PushVectorEnv.reset
+
+    def record(env, **kw):
+        shares.append((env.num_envs, env.near_share))
+        return reset(env, **kw)
+
+    monkeypatch.setattr(PushVectorEnv, "reset", record)
+    changes = dict(near_share=0.6, updates=3, resume_every=1)
+    stage.main(stage.Config(preset="smoke", out=tmp_path, device="cpu", **stage.PRESETS["smoke"] | changes))
+    assert [share for worlds, share in shares if worlds == 32] == pytest.approx([0.6, 0.4, 0.2])
+    assert {share for worlds, share in shares if worlds == 16} == {0}
