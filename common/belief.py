@@ -34,26 +34,26 @@ class Believed(EpisodeWrapper):
 
     def begin(self, worlds, obs, infos):
         belief, hidden = believe(self.estimator, obs, None, self.passes)
-        if len(worlds) == self.num_envs:
-            self.hidden = hidden
-        else:
-            self.remember(worlds, hidden)
+        self.remember(worlds, hidden)
         infos.setdefault("belief", belief)
         return belief[:, :self.size]
 
     def observe(self, obs, infos):
         watched = self.unwrapped.watched
         if len(watched) == self.num_envs:
-            self.belief, self.hidden = believe(self.estimator, obs, self.hidden, self.passes)
+            self.belief, hidden = believe(self.estimator, obs, self.hidden, self.passes)
         else:
             hidden = tuple(h[:, watched] for h in self.hidden)
             self.belief = self.belief.copy()  # the last one stays in the infos of its step
             self.belief[watched], hidden = believe(self.estimator, obs[watched], hidden, self.passes)
-            self.remember(watched, hidden)
+        self.remember(watched, hidden)
         infos["belief"] = self.belief
         return self.belief[:, :self.size]
 
     def remember(self, worlds, hidden):
         """Puts the hidden state of `worlds` (k,) in its place."""
+        if len(worlds) == self.num_envs:
+            self.hidden = hidden
+            return
         for all_worlds, new in zip(self.hidden, hidden):
             all_worlds[:, worlds] = new.to(all_worlds.dtype)

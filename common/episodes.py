@@ -31,7 +31,7 @@ def play(env, actor, seed, greedy=True, record=None):
         running &= ~(terminated | truncated)
         if not running.any():
             break
-        kept = fewer(running[watched])
-        env.unwrapped.watched = watched = watched[kept]
-        hidden = tuple(h[:, kept] for h in hidden)
+        if len(kept := fewer(running[watched])) < len(watched):
+            env.unwrapped.watched = watched = watched[kept]
+            hidden = tuple(h[:, kept] for h in hidden)
     return success, length

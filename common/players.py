@@ -43,7 +43,7 @@ class Players:
             told = [geometry.contact_switches(env.episode(i, n)["state"], self.world.box) for i, n in enumerate(length)]
         if m.errors:
             scale = getattr(self.estimator(METHODS[m.method].estimator), "scale", None)
-            told = trajectories.in_the_loop(env.rows, length, success, env.unwrapped.world.horizon, scale)
+            told = trajectories.in_the_loop(env, length, success, scale)
         return told[:m.episodes - number * m.width(self.cfg)]
 
     def trajectories(self, row):

@@ -90,16 +90,17 @@ def compared(q_hat, variance, q, occluded, mask, scale=None):
     return told
 
 
-def in_the_loop(rows, length, success, horizon, scale=None):
-    """Of the beliefs while a policy played, from film.Recorded's rows, lengths and success (N,) of the episodes and the most
-    steps that there can be: for each episode `compared`'s parts, and calibration's "course".
+def in_the_loop(env, length, success, scale=None):
+    """Of the beliefs while a policy played, from a film.Recorded `env`, lengths and success (N,) of the episodes: for each
+    episode `compared`'s parts, and calibration's "course".
     """
-    state, o, belief = (np.stack([row[name] for row in rows[:length.max()]]).astype(float) for name in ("state", "o", "belief"))
+    rows = env.rows[:length.max()]
+    state, o, belief = (np.stack([row[name] for row in rows]).astype(float) for name in ("state", "o", "belief"))
     q = symmetry.mirror(task.scale(state), symmetry.signs(o[0]))[..., :4]
     mask, variance = (np.arange(len(q))[:, None] < length).astype(np.float32), np.square(belief[..., 8:])
     told = compared(belief[..., :4], variance, q, o[..., 8], mask, scale)
     if "calibration" in told:
-        told["course"] = calibration.course(variance, length, success, horizon).T
+        told["course"] = calibration.course(variance, length, success, env.unwrapped.world.horizon).T
     return [dict(zip(told, values)) for values in zip(*(sums.T.tolist() for sums in told.values()))]
 
 

@@ -20,6 +20,7 @@ from common.robot.iiwa import IIWA  # noqa: E402
 from common.task import World  # noqa: E402
 
 speed.set_up()
+SHORT = World(time_limit=11.0)  # of the robot's runs: a hand that covers the tags for 5 s has left before
 SCRIPTS = ["01_train_privileged", "02_collect", "03_train_estimator", "04_train_policy", "05_evaluate", "06_robot"]
 
 
@@ -99,8 +100,8 @@ def model(request):
 
 
 @dataclass
-class Short(command.Stage):
-    world: OmitArgPrefixes[World] = World(time_limit=11.0)  # a hand that covers the tags for 5 s has left before
+class Worldly(command.Stage):
+    world: OmitArgPrefixes[World] = World()
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +109,7 @@ def nets(tmp_path_factory):
     """A root with an untrained estimator and policy, as stages 03 and 04 leave them."""
     torch.manual_seed(2)  # some untrained nets drive the box to where its film cannot be tracked anew
     out = tmp_path_factory.mktemp("robot") / "runs"
-    cfg = Short(preset="smoke", out=out)
+    cfg = Worldly(preset="smoke", out=out, world=SHORT)
     for stage, method, name, net in (
             ("03_train_estimator", "ours", "estimator.safetensors", networks.Estimator((16, 16, 16))),
             ("04_train_policy", "est_uncertainty", "policy.safetensors", networks.policy(12, (16, 16, 16)))):

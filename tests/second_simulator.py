@@ -184,7 +184,7 @@ def main(cfg):
             success, length, env, dynamics = play(stacks.METHODS[name], cfg.episodes, cfg, paths, world, feet)
             errors = ["", ""]
             if name == "est_uncertainty":
-                told = statistics.in_the_loop(trajectories.in_the_loop(env.rows, length, success, env.unwrapped.world.horizon))
+                told = statistics.in_the_loop(trajectories.in_the_loop(env, length, success))
                 errors = [f"{told[key]:.1f}" for key in ("trans_mean_l2_mm", "rot_mean_abs_deg")]
             rows.append([support, name, tables.percent(statistics.wilson(success)), *errors])
         c, off, way, count = compare(env.rows, length, dynamics, world)

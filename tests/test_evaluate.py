@@ -101,7 +101,7 @@ def test_recorded_keeps_the_end_of_an_episode():
 
 def test_errors_in_the_loop_are_those_of_the_beliefs_before_the_actions():
     success, length, env = players().chunk(evaluate.Measurement("est_uncertainty", 6), 0)
-    told = trajectories.in_the_loop(env.rows, length, success, 30, [2.0] * 4)
+    told = trajectories.in_the_loop(env, length, success, [2.0] * 4)
     for world, n in enumerate(length):
         episode = env.episode(world, n)
         state, belief = episode["state"][:n], episode["belief"][:n]

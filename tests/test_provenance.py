@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
-from tyro.conf import OmitArgPrefixes
+from conftest import Worldly
 
 from common import command, runs
 from common.command import setting
@@ -111,11 +111,6 @@ def test_every_published_run_has_the_settings_of_its_preset(folder, tmp_path):
 
 
 # Worlds
-
-
-@dataclass
-class Worldly(command.Stage):
-    world: OmitArgPrefixes[World] = World()
 
 
 def test_a_run_has_the_world_of_its_inputs(config, tmp_path):

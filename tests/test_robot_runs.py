@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import Short
+from conftest import SHORT
 from robot_arms import mistakes
 
 from common import networks, stacks, symmetry, task
@@ -148,7 +148,7 @@ def test_a_real_arms_helper_is_told_when_to_cover_the_tags(robot, monkeypatch, a
     monkeypatch.setattr(networks, "mode", lambda logits: torch.full((1, 2), 5))
     stdout, _, _, folder = robot("--arm", "robot_arms:Driver", "--scenario", "hand_5s")
     assert stdout.index("now cover the tags") < stdout.index("now uncover the tags")
-    assert len(np.load(folder / "hand_5s_000.npz")["time"]) == Short.world.horizon
+    assert len(np.load(folder / "hand_5s_000.npz")["time"]) == SHORT.horizon
 
 
 def test_a_real_arm_needs_someone_at_the_terminal(robot, monkeypatch):
