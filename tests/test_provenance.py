@@ -17,15 +17,7 @@ from common.task import C_060, World
 from common.weights import save_tensors
 
 ROOT = Path(__file__).parent.parent
-BEFORE = World("inner", support=C_060, support_offset=(0.0, 0.0))
-WORLD = ["--starts", "inner", "--support", *map(repr, C_060), "--support-offset", "0", "0"]
-RECIPE = {"01_train_privileged": [*WORLD, "--sizes", "128", "256", "128", "--updates", "1000", "--kl-target-end", "None",
-                                  "--lr-min", "1e-4"],
-          "03_train_estimator": ["--sizes", "256", "256", "256", "--dropout", "0.2", "--epochs", "20",
-                                 "--optimizer", "adam"],
-          "04_train_policy": ["--kl-target", "0.015", "--kl-target-end", "0.003"]}
-RECORDS = [path.parent.relative_to(ROOT / "pretrained") for path in sorted((ROOT / "pretrained").rglob("config.json"))]
-PUBLISHED = [folder for folder in RECORDS if folder.parts[0] != "next"]  # in the world, and by the recipe, of before
+PUBLISHED = [path.parent.relative_to(ROOT / "pretrained") for path in sorted((ROOT / "pretrained").rglob("config.json"))]
 
 
 @dataclass
@@ -89,17 +81,13 @@ def test_a_setting_that_the_code_does_not_know_is_told(config):
         runs.Run(config(), "01_a")
 
 
-@pytest.mark.parametrize("folder", RECORDS, ids=str)
+@pytest.mark.parametrize("folder", PUBLISHED, ids=str)
 def test_every_published_run_has_the_settings_of_its_preset(folder, tmp_path):
     """Those that it does not know, or by other names, included."""
-    root = ROOT / "pretrained" / ("" if folder in PUBLISHED else "next")
-    shutil.copytree(root, tmp_path / "laptop")
-    folder = (ROOT / "pretrained" / folder).relative_to(root)
+    shutil.copytree(ROOT / "pretrained", tmp_path / "laptop")
     stage, *method, seed = folder.parts
     module = importlib.import_module(stage)
     options = ["--method", *method] * bool(method) + ["--seed", seed[4:], "--out", str(tmp_path)]
-    if root.name != "next":
-        options += RECIPE.get(stage, [])
     cfg, reads = command.parse(module.Config, module.PRESETS, "", ["laptop", *options]), None
     if stage.startswith("04"):
         cfg = module.with_sizes(cfg)
@@ -135,15 +123,15 @@ def test_a_run_of_before_the_world_is_known_by_its_world(config, tmp_path):
     path = make(cfg, "01_a", 1)
     record(path, starts=None, support=None, support_offset=None, time_limit=None)
     old = runs.Run(config(), "02_b", {"a": path}).world
-    assert old == BEFORE and old.dynamics["limit_surface_c"] == (0.060, 0.060)
+    assert old == World("inner", support=C_060, support_offset=(0.0, 0.0)) and old.dynamics["limit_surface_c"] == (0.060, 0.060)
     with pytest.raises(UserError, match="starts inner -> box, support "):
         runs.Run(cfg, "01_a")
 
 
 @pytest.mark.parametrize("folder", PUBLISHED, ids=str)
-def test_published_nets_are_of_the_world_of_before(folder):
+def test_published_nets_are_of_the_world_of_today(folder):
     record = json.loads((ROOT / "pretrained" / folder / "config.json").read_text())
-    assert World.of(record["settings"] | record.get("world", {})) == BEFORE
+    assert World.of(record["settings"] | record.get("world", {})) == World()
 
 
 # Weights from elsewhere
