@@ -20,8 +20,9 @@ class PushVectorEnv(gym.vector.VectorEnv):
     Observation: (N, 8) float32, the true state scaled as in appendix B (task.scale).
     Reward: sec. 4 (task.reward). Termination: success (looked at first) or the centre of box or pusher outside
     the workspace. Truncation: at the world's time limit.
-    Infos: `state` (N, 7) true states in SI units and `success` (N,) of this step. Where an episode ended, `_final_obs` (N,)
-    is set, `final_obs` (N, 8) and `final_state` (N, 7) hold its end, and observation and `state` start the next episode.
+    Infos: `state` (N, 7) true states in SI units and `success` (N,) of this step, and whether its episode was `aided` (N,) at
+    its start. Where an episode ended, `_final_obs` (N,) is set, `final_obs` (N, 8) and `final_state` (N, 7) hold its end, and
+    observation and `state` start the next episode.
 
     Args: world: task.World, what is drawn for an episode; sub_steps: physics steps a control step; threads: as in
     simulator.Worlds; they change no bit.
@@ -31,7 +32,8 @@ class PushVectorEnv(gym.vector.VectorEnv):
         a wrapper need not work for the others.
         worlds: simulator.Worlds, the physics; its box, pusher, force, dynamics (here the drawn ones) and state are here too.
         tolerance, near_share: a curriculum's (training.py; 1 and 0 are none): the factor on the success tolerance, and the
-        share of episodes that start with the box at a random fraction of its way from the target and the pusher beside it.
+        share of episodes that are aided: they start with the box at a random fraction of its way from the target and the pusher
+        beside it.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
@@ -42,7 +44,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
         self.single_action_space = gym.spaces.MultiDiscrete([task.BINS, task.BINS])
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
-        self.tolerance, self.near_share = 1.0, 0.0
+        self.tolerance, self.near_share, self._aided = 1.0, 0.0, np.zeros(num_envs, bool)
         self.worlds = Worlds(num_envs, sub_steps, threads=threads, size=self.world.box, surface=self.world.surface)
         self._steps = np.zeros(num_envs, int)
 
@@ -61,7 +63,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
         return boxes
 
     def _draw_start(self, count, box=None, pusher=None):
-        """Starts of the world around what is given; the curriculum's: box nearer to the target, pusher within 3 cm of it."""
+        """Starts of the world around what is given, and whether they are aided: box nearer to the target, pusher within 3 cm."""
         rng = self.np_random
         near = rng.random(count) < self.near_share
         boxes = self._draw_boxes(count) * np.where(near, rng.random(count), 1.0)[:, None] if box is None else box
@@ -73,10 +75,10 @@ class PushVectorEnv(gym.vector.VectorEnv):
                     pushers[i] = rng.uniform(-1, 1, 2) * task.HALF
                 else:
                     boxes[i] = self._draw_boxes(1)[0]
-        return boxes, pushers
+        return boxes, pushers, near
 
     def _start(self, worlds, **given):
-        box, pusher = self._draw_start(len(worlds), given.pop("box", None), given.pop("pusher", None))
+        box, pusher, self._aided[worlds] = self._draw_start(len(worlds), given.pop("box", None), given.pop("pusher", None))
         self.worlds.place(worlds, box, pusher, self.world.draw(self.np_random, len(worlds), given))
         self._steps[worlds] = 0
 
@@ -122,7 +124,7 @@ class PushVectorEnv(gym.vector.VectorEnv):
         reward, terminated, truncated, success = self.advance(action)
         state = self.state
         obs = self.scaled(state)
-        infos = {"state": state, "success": success}
+        infos = {"state": state, "success": success, "aided": self._aided.copy()}
         ended = np.flatnonzero(terminated | truncated)
         if ended.size:
             infos |= {"final_obs": obs, "final_state": state, "_final_obs": terminated | truncated}

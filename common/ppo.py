@@ -46,15 +46,15 @@ def rollout(env, actor, critic, carry, steps):
     Args:
         carry: observations (N, D) and the hidden states of actor and critic, each its (h, c).
     Returns: batch: obs (T, N, D), actions (T, N, 2), logp (T, N, 2, 11), reward, terminated, done, value V(s_t) and next_value
-    V(s_{t+1}) (T, N; any where terminated), success (episodes, successes), hidden_pi and hidden_v at the start; and the next
-    carry.
+    V(s_{t+1}) (T, N; any where terminated), success and aided (T, N) as the env tells them, hidden_pi and hidden_v at the
+    start; and the next carry.
     """
     device = next(actor.parameters()).device
     obs, hidden_pi, hidden_v = carry
     start = {"hidden_pi": hidden_pi, "hidden_v": hidden_v}
     b = {"obs": np.zeros((steps, *obs.shape), np.float32), "reward": np.zeros((steps, len(obs)), np.float32)}
-    b |= {name: np.zeros((steps, len(obs)), bool) for name in ("terminated", "done")}
-    actions, logps, value, cut, successes = [], [], [], [], 0
+    b |= {name: np.zeros((steps, len(obs)), bool) for name in ("terminated", "done", "success", "aided")}
+    actions, logps, value, cut = [], [], [], []
 
     def see(net, obs, hidden):
         with torch.no_grad(), speed.autocast(device):
@@ -69,6 +69,7 @@ def rollout(env, actor, critic, carry, steps):
         logps.append(log_softmax(logits[0]))
         obs, b["reward"][t], b["terminated"][t], truncated, infos = env.step(action.cpu().numpy())
         b["done"][t] = b["terminated"][t] | truncated
+        b["success"][t], b["aided"][t] = infos["success"], infos["aided"]
         v, hidden_v = judging.result()
         value.append(v[0, :, 0])
         if "final_obs" in infos:
@@ -77,13 +78,11 @@ def rollout(env, actor, critic, carry, steps):
                 cut.append((t, late, see(critic, infos["final_obs"][late], tuple(h[:, late] for h in hidden_v))[0][0, :, 0]))
             ended = torch.as_tensor(b["done"][t], device=device)
             hidden_pi, hidden_v = forget(hidden_pi, ended), forget(hidden_v, ended)
-            successes += int((infos["success"] & b["done"][t]).sum())
     batch = {k: torch.as_tensor(v, device=device) for k, v in b.items()}
     batch |= start | {"actions": torch.stack(actions), "logp": torch.stack(logps), "value": torch.stack(value)}
     batch["next_value"] = torch.cat([batch["value"][1:], see(critic, obs, hidden_v)[0][..., 0]])
     for t, worlds, v in cut:  # the time limit: the episode would have gone on
         batch["next_value"][t, worlds] = v
-    batch["success"] = (int(b["done"].sum()), successes)
     return batch, (obs, hidden_pi, hidden_v)
 
 

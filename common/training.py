@@ -10,8 +10,8 @@ from common import episodes, ppo, ranks
 from common.files import UserError
 from common.progress import bar
 
-# The curriculum lowers the tolerance by 5 % when of the last 512 episodes, which tell a rate within 2 points, 60 % succeed:
-# often enough to be found at the next tolerance too, and seldom enough that there is more to learn
+# The curriculum lowers the tolerance by 5 % when of the last 512 episodes without aid, which tell a rate within 2 points, 60 %
+# succeed: often enough to be found at the next tolerance too, and seldom enough that there is more to learn
 EPISODES, SHARE, FACTOR = 512, 0.6, 0.95
 CURRICULUM = ("tolerance", "episodes", "successes")  # its state, as `lowered` takes it
 STATS = ("train_success", "train_return", "train_length", "policy_loss", "clip_fraction", "kl", "entropy", "value_loss",
@@ -26,19 +26,21 @@ def lowered(tolerance, ended, successes):
 
 
 def ended_episodes(batch, running):
-    """Of the episodes that ended in a rollout, in all processes: their number, successes, and {mean success, return, length},
-    nan where none did.
+    """Of the episodes that ended in a rollout, in all processes: number and successes of those without aid, which the
+    curriculum counts; and {mean success, return, length} of all, nan where none did.
 
     Args:
         running: (2, N) return and length so far of the episodes that run; goes on.
     """
+    rewards, ends, success, aided = (batch[name].cpu().numpy() for name in ("reward", "done", "success", "aided"))
     sums = np.zeros(2)
-    for reward, done in zip(batch["reward"].cpu().numpy(), batch["done"].cpu().numpy()):
+    for reward, done in zip(rewards, ends):
         running += np.stack([reward, np.ones_like(reward)])
         sums += running[:, done].sum(1)
         running[:, done] = 0
-    count, successes, *sums = ranks.totals(*batch["success"], *sums)
-    return count, successes, {name: total / count if count else math.nan for name, total in zip(STATS, (successes, *sums))}
+    unaided = ends & ~aided
+    counted, won, count, *sums = ranks.totals(unaided.sum(), success[unaided].sum(), ends.sum(), success[ends].sum(), *sums)
+    return counted, won, {name: total / count if count else math.nan for name, total in zip(STATS, sums)}
 
 
 def held_out_success(env, actor, seed):

@@ -114,9 +114,12 @@ def test_near_starts_are_an_aid():
     env = PushVectorEnv(400)
     env.near_share = 0.5
     env.reset(seed=9)
-    near = np.array([geometry.nearest(box, pusher)[0] for box, pusher in zip(env.box, env.pusher)]) <= 0.03
+    box, pusher = env.box.copy(), env.pusher.copy()
+    aided = env.step(np.full((400, 2), 5))[4]["aided"]
+    near = np.array([geometry.nearest(*start)[0] for start in zip(box, pusher)]) <= 0.03
+    assert 0.4 < aided.mean() < 0.6 and near[aided].all()
     assert 0.5 < near.mean() < 0.75  # some are near by chance
-    assert np.linalg.norm(env.box[near, :2], axis=1).mean() < 0.8 * np.linalg.norm(env.box[~near, :2], axis=1).mean()
+    assert np.linalg.norm(box[near, :2], axis=1).mean() < 0.8 * np.linalg.norm(box[~near, :2], axis=1).mean()
 
 
 @pytest.mark.parametrize("name", RANGES)

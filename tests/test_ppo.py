@@ -32,9 +32,9 @@ class ToyEnv(gym.vector.VectorEnv):
     def step(self, action):
         self.steps += 1
         obs, reward, terminated, truncated = self.advance(action)
-        infos, ended = {}, terminated | truncated
+        infos, ended = {"success": self.success, "aided": np.zeros(self.num_envs, bool)}, terminated | truncated
         if ended.any():
-            infos = {"final_obs": obs, "_final_obs": ended, "success": self.success}
+            infos |= {"final_obs": obs, "_final_obs": ended}
             self.steps[ended] = 0
             obs = obs.copy()
             obs[ended] = self.begin(np.flatnonzero(ended))
@@ -149,7 +149,8 @@ def test_a_rollout_keeps_what_the_env_said():
     assert batch["reward"].numpy() == pytest.approx(np.stack(reward), abs=1e-6)
     assert (batch["done"].numpy() == np.stack(terminated) | np.stack(truncated)).all()
     assert (batch["terminated"].numpy() == np.stack(terminated)).all()
-    assert batch["success"] == (batch["done"].sum(), np.stack(terminated).sum())
+    for name in ("success", "aided"):
+        assert (batch[name].numpy() == np.stack([told[name] for told in infos])).all()
     torch.testing.assert_close(batch["logp"].exp().sum(-1), torch.ones(30, 5, 2))
 
 
@@ -338,7 +339,7 @@ def remembers(actor, critic, updates, blanks=20):
     carry, share = (env.reset()[0], actor.initial(64), critic.initial(64)), []
     while len(share) < updates and np.mean(share[-5:] or 0) < 0.95:
         batch, carry = ppo.rollout(env, actor, critic, carry, blanks + 1)
-        share.append(batch["success"][1] / batch["success"][0])
+        share.append(batch["success"][batch["done"]].float().mean())
         ppo.update(actor, critic, both, ppo.sequences(batch, hp.gamma, hp.lam), hp)
     return np.mean(share[-5:])
 

@@ -22,27 +22,34 @@ def test_the_tolerance_is_lowered_as_episodes_succeed(tolerance, ended, successe
     assert training.lowered(tolerance, ended, successes) == pytest.approx(wanted)
 
 
-def batch(reward, done, successes):
+def batch(reward, done, success, aided=(False, False)):
     """What training.ended_episodes reads of a rollout: (T, N) each."""
-    done = torch.tensor(done).bool()
-    return {"reward": torch.tensor(reward), "done": done, "success": (int(done.sum()), successes)}
+    done, success = torch.tensor(done).bool(), torch.tensor(success).bool()
+    return {"reward": torch.tensor(reward), "done": done, "success": success, "aided": torch.tensor(aided).expand(done.shape)}
 
 
 def test_episodes_are_counted_across_rollouts():
     running = np.zeros((2, 2))
-    *counts, first = training.ended_episodes(batch([[1.0, 10.0], [2.0, 20.0]], [[0, 0], [1, 0]], 1), running)
+    *counts, first = training.ended_episodes(batch([[1.0, 10.0], [2.0, 20.0]], [[0, 0], [1, 0]], [[0, 0], [1, 0]]), running)
     assert counts == [1, 1]  # episodes, successes
     assert first == {"train_success": 1, "train_return": 1 + 2, "train_length": 2}
     assert running.tolist() == [[0, 10 + 20], [0, 2]]
-    *_, second = training.ended_episodes(batch([[4.0, 40.0], [5.0, 50.0], [6.0, 60.0]], [[1, 1], [0, 0], [0, 1]], 1), running)
+    *_, second = training.ended_episodes(
+        batch([[4.0, 40.0], [5.0, 50.0], [6.0, 60.0]], [[1, 1], [0, 0], [0, 1]], [[0, 1], [0, 0], [0, 0]]), running)
     assert second == {"train_success": pytest.approx(1 / 3), "train_return": (4 + (10 + 20 + 40) + (50 + 60)) / 3,
                       "train_length": (1 + 3 + 2) / 3}
     assert running.tolist() == [[5 + 6, 0], [2, 0]]
-    *_, third = training.ended_episodes(batch([[7.0, 70.0]], [[0, 0]], 0), running)
+    *_, third = training.ended_episodes(batch([[7.0, 70.0]], [[0, 0]], [[0, 0]]), running)
     assert all(map(math.isnan, third.values())) and third.keys() == first.keys()
     assert running.tolist() == [[5 + 6 + 7, 70], [3, 1]]
-    *_, fourth = training.ended_episodes(batch([[8.0, 80.0]], [[1, 0]], 0), running)
+    *_, fourth = training.ended_episodes(batch([[8.0, 80.0]], [[1, 0]], [[0, 0]]), running)
     assert fourth == {"train_success": 0, "train_return": 5 + 6 + 7 + 8, "train_length": 4}
+
+
+def test_the_curriculum_counts_no_aided_episode():
+    running = np.zeros((2, 2))
+    *counts, stats = training.ended_episodes(batch([[1.0, 3.0]], [[1, 1]], [[1, 0]], aided=(True, False)), running)
+    assert counts == [1, 0] and stats == {"train_success": 0.5, "train_return": 2.0, "train_length": 1}  # of both
 
 
 def test_near_starts_fade_and_held_out_episodes_have_none(monkeypatch, tmp_path):
