@@ -37,7 +37,7 @@ class Config(command.Reader):
 
 PRESETS = {
     "smoke": dict(sizes=(16, 16, 16), sequences=16, epochs=2, fresh=True, optimizer="muon", validation=12),
-    "quick": dict(sizes=(256, 256, 256), dropout=0.05, sequences=32, epochs=8, fresh=True, optimizer="muon", lr=4e-3,
+    "quick": dict(sizes=(128, 256, 256), dropout=0.05, sequences=32, epochs=8, fresh=True, optimizer="muon", lr=4e-3,
                   lr_end=5e-5, validation=500),
     "laptop": dict(sizes=(128, 256, 256), dropout=0.05, sequences=32, epochs=10, fresh=True, optimizer="muon", lr=4e-3,
                    lr_end=5e-5, validation=1000),

@@ -45,7 +45,7 @@ PRESETS = {
                        filter_trajectories=None, weights=Path(__file__).parent / "pretrained"),
     "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, other_episodes=None, passes=2, test=12,
                   num_envs=16, filter_trajectories=1, particles=10),
-    "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, other_episodes=300, passes=20, test=2000, num_envs=300,
+    "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, other_episodes=300, passes=10, test=2000, num_envs=300,
                   filter_trajectories=20, particles=300),
     "laptop": dict(switch_episodes=2000, passes=10),
     "paper": {},
