@@ -15,14 +15,16 @@ def orthogonal(x):
     """Matrices (k, m, n) with their singular values brought near 1: all but the very small ones to between 0.68 and 1.2."""
     x = x / (x.norm(dim=(1, 2), keepdim=True) + 1e-7)
     flat = x if x.shape[1] <= x.shape[2] else x.mT
-    for _ in range(STEPS):
-        gram = flat @ flat.mT
-        flat = A * flat + (B * gram + C * gram @ gram) @ flat
-    return flat if x.shape[1] <= x.shape[2] else flat.mT
+    with speed.autocast(x.device):
+        for _ in range(STEPS):
+            gram = flat @ flat.mT
+            polynomial = torch.baddbmm(gram, gram, gram, beta=B, alpha=C)
+            flat = torch.baddbmm(flat, polynomial, flat, beta=A)
+    return (flat if x.shape[1] <= x.shape[2] else flat.mT).to(x.dtype)
 
 
 class Muon(torch.optim.Optimizer):
-    """torch.optim.Muon without its bfloat16, which many CPUs only imitate, and a gate of an LSTM at a time.
+    """torch.optim.Muon, in bfloat16 only where the CPU computes in it, and a gate of an LSTM at a time.
 
     Args: params: matrices, in groups with `blocks`, how many stand one above the other in each; lr: of the same size as Adam's.
     """

@@ -150,7 +150,7 @@ def test_a_mini_batch_of_two_counts_every_step_the_same(of_both):
         torch.testing.assert_close(rank["regression"], alone, rtol=1e-5, atol=1e-5)
 
 
-def test_muon_shares_its_matrices_out_and_steps_as_one_process_does(of_both):
+def test_muon_shares_its_matrices_out_and_steps_as_one_process_does(of_both, float32):
     alone = muon_steps()
     for rank, calls in zip(of_both, (3, 6)):  # the dearest of three matrices is rank 0's
         torch.testing.assert_close(rank["muon"]["net"], alone["net"], rtol=0, atol=0)
