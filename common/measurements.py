@@ -4,7 +4,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 
 from common.stacks import METHODS
-from common.task import C_060, STARTS, Other, World
+from common.task import C_060, DRAWN, STARTS, Other, World
 
 DURATIONS = {"0": 0.0, "2.5": 2.5, "5": 5.0, "10": 10.0, "full": math.inf}  # s; the paper's own grid is in its plot only
 FILTERED = ("c=0.042", "c=0.078", "support_offset=8mm")  # other worlds in which the particle filter is measured
@@ -54,13 +54,17 @@ def measurements(cfg, policies, world):
 
 
 def other_worlds(world):
-    """{row: task.Other} of a task.World, those left out that are none. c's rows have its values under the study's box."""
+    """{row: task.Other} of a task.World, those left out that are none, or the world itself. c's rows have its values under the
+    study's box; `paper` has the ranges of the paper's table, where training draws from wider ones.
+    """
     base, (length, width, height) = Other(**asdict(world)), world.box
     changes = {
+        "paper": {name: getattr(World, name) for name in DRAWN},
         "c=0.042": {"support": (0.0, 0.0)}, "c=0.060": {"support": C_060}, "c=0.078": {"support": (1.0, 1.0)},
         "support_offset=8mm": {"support_offset": (0.008, 0.008)},
         "mass=1-1.5": {"mass": (1.0, 1.5)}, "mass=5-6": {"mass": (5.0, 6.0)},
         "mu=0.05-0.1": {"mu_dynamic": (0.05, 0.1)}, "mu=0.3-0.6": {"mu_dynamic": (0.3, 0.6)},
+        "mu_pusher=0.6-0.9": {"mu_pusher": (0.6, 0.9)},
         "box=-2cm": {"box": (length - 0.02, width, height)}, "box=+2cm": {"box": (length + 0.02, width, height)},
         "box=+2cm_wide": {"box": (length, width + 0.02, height)},
         "noise=2x": {"noise": tuple(2 * x for x in world.noise)}, "bias=2x": {"bias": tuple(2 * x for x in world.bias)},
@@ -70,4 +74,4 @@ def other_worlds(world):
     for row, change in changes.items():
         with suppress(ValueError):
             worlds[row] = replace(base, **change)
-    return worlds
+    return {row: other for row, other in worlds.items() if other != base}

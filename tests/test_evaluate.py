@@ -121,6 +121,8 @@ def test_errors_in_the_loop_are_those_of_the_beliefs_before_the_actions():
 def test_other_worlds_differ_in_one_thing():
     world = task.World(mass=(2.0, 2.5))
     base = task.Other(**asdict(world))
+    assert measurements.other_worlds(world)["paper"].mass == task.World.mass and "time=30s" in measurements.other_worlds(world)
+    assert not {"paper", "time=30s"} & {*measurements.other_worlds(task.World(time_limit=30.0))}
     for row, other in measurements.other_worlds(world).items():
         changed = [name for name in asdict(other) if getattr(other, name) != getattr(base, name)]
         assert len(changed) == 1, row
