@@ -19,7 +19,7 @@ import numpy as np
 
 from common import calibration, command, film, particles, plots, ranks, runs, stacks, statistics, tables, task, trajectories
 from common.files import UserError, load_json, save_json, write_atomic
-from common.measurements import FILTERED, Measurement, measurements
+from common.measurements import FILTERED, Measurement, measurements, other_worlds
 from common.players import LIST, Players
 from common.progress import bar
 from common.stacks import ESTIMATORS, METHODS, TRAINED
@@ -198,7 +198,8 @@ def main(cfg):
     pi_priv, tested = policies["priv_on_state", 0], [kind for kind in estimators if not ESTIMATORS[kind].scaled]
     sources = {f"estimator_ablation/{kind}": sha(*test_paths.values(), *estimators.get(kind, ())) for kind in ("vision", *tested)}
     sources |= {f"filter/{row}/{kind}": sha(*test_paths.values(), pi_priv, *estimators.get(kind, ()))
-                for row in ("test", "drifting", *FILTERED) if cfg.filter_trajectories for kind in ("vision", *tested, "filter")}
+                for row in ("test", "drifting", *(row for row in FILTERED if row in other_worlds(run.world)))
+                if cfg.filter_trajectories for kind in ("vision", *tested, "filter")}
     sources |= {name: sha(policies[m.method, m.seed], *estimators.get(METHODS[m.method].estimator, ()))
                 + [calibration.PARTS] * m.errors for name, m in todo.items()}
     files = {name: run.dir / "measurements" / name / f"{hashlib.sha256(repr(made_of).encode()).hexdigest()[:16]}.json"

@@ -121,13 +121,13 @@ def test_errors_in_the_loop_are_those_of_the_beliefs_before_the_actions():
 def test_other_worlds_differ_in_one_thing():
     world = task.World(mass=(2.0, 2.5))
     base = task.Other(**asdict(world))
-    assert measurements.other_worlds(world)["paper"].mass == task.World.mass and "time=30s" in measurements.other_worlds(world)
+    rows = measurements.other_worlds(world)
+    assert rows["paper"].mass == task.World.mass and "time=30s" in rows
     assert not {"paper", "time=30s"} & {*measurements.other_worlds(task.World(time_limit=30.0))}
-    for row, other in measurements.other_worlds(world).items():
+    for row, other in rows.items():
         changed = [name for name in asdict(other) if getattr(other, name) != getattr(base, name)]
         assert len(changed) == 1, row
         assert row.startswith(measurements.SENSED) == (changed[0] in ("noise", "bias", "gain", "late"))
-    rows = measurements.other_worlds(world)
     assert rows["c=0.042"].dynamics["limit_surface_c"] == pytest.approx((0.0422, 0.0422), abs=1e-4)
     assert rows["c=0.060"].dynamics["limit_surface_c"] == (0.060, 0.060) and rows["mu=0.3-0.6"].mu_dynamic == (0.3, 0.6)
     assert rows["box=-2cm"].box == pytest.approx((0.10, 0.10, 0.07)) and rows["noise=2x"].noise[3] == 1.4
