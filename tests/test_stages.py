@@ -190,6 +190,13 @@ def test_other_worlds_are_played_by_every_policy_that_estimates(copy, call, monk
     assert (out / "smoke/05_evaluate/seed0/other_worlds.png").exists()
 
 
+def test_the_filter_has_no_row_of_the_nets_own_world(tmp_path, call):
+    for script, *settings in ((SCRIPTS[0], "--support", "1", "1"), (SCRIPTS[1],), (SCRIPTS[4],)):
+        assert call(tmp_path, script, *settings)[2] == 0
+    results = json.loads((tmp_path / "smoke/05_evaluate/seed0/results.json").read_text())
+    assert results["filter"].keys() == {"test", "drifting", *measurements.FILTERED} - {"c=0.078"}
+
+
 def test_the_ablation_is_measured_on_the_test_set(study):
     folder, draws = study / "smoke" / "02_collect" / "seed0", importlib.import_module("05_evaluate").LIST
     test = trajectories.load(*(folder / file for file in trajectories.files("test")))
