@@ -39,7 +39,7 @@ PRESETS = {
     "smoke": dict(sizes=(16, 16, 16), sequences=16, epochs=2, fresh=True, optimizer="muon", validation=12),
     "quick": dict(sizes=(128, 256, 256), dropout=0.05, sequences=32, epochs=8, fresh=True, optimizer="muon", lr=4e-3,
                   lr_end=5e-5, validation=500),
-    "laptop": dict(sizes=(128, 256, 256), dropout=0.05, sequences=32, epochs=10, fresh=True, optimizer="muon", lr=4e-3,
+    "laptop": dict(sizes=(256, 256, 256), dropout=0.05, sequences=32, epochs=8, fresh=True, optimizer="muon", lr=2.5e-3,
                    lr_end=5e-5, validation=1000),
     "paper": {},
 }
