@@ -8,6 +8,8 @@ from common import muon, ranks, speed, trajectories
 from common.files import UserError
 from common.progress import bar
 
+EXPLODED = 1e4  # norm of a gradient that came through an LSTM at the edge of chaos: of 1e5 to 1e17, not of 40
+
 
 def check(data, sequences):
     """Raises UserError: there are more processes than trajectories in a mini-batch."""
@@ -28,15 +30,18 @@ def validate(loss, data, limit, sequences, device, world):
 
 
 def _descend(loss, batch, draws, parameters, optimizers, grad_norm, usual):
-    """One step on a mini-batch, weighed by its steps, `usual` ones on average: mean loss and valid steps of all ranks."""
+    """One step on a mini-batch, weighed by its steps, `usual` ones on average: mean loss and valid steps of all ranks.
+
+    None where the gradient has exploded: clipped, it points nowhere, and a few such steps in a row lose the net for good.
+    """
     halves = speed.halves(batch) if ranks.COUNT == 1 else [batch]  # two threads, or a process each
     mean, steps = speed.set_gradient(loss, halves, draws, parameters)
     mean, steps = ranks.average(parameters, mean, steps)
-    torch.nn.utils.clip_grad_norm_(parameters, grad_norm)
-    for parameter in parameters:  # a step counts the same in each mini-batch
-        parameter.grad *= steps / usual
-    for optimizer in optimizers:
-        optimizer.step()
+    if torch.nn.utils.clip_grad_norm_(parameters, grad_norm) < EXPLODED:  # nor is NaN
+        for parameter in parameters:  # a step counts the same in each mini-batch
+            parameter.grad *= steps / usual
+        for optimizer in optimizers:
+            optimizer.step()
     return mean.item(), float(steps)
 
 

@@ -32,6 +32,20 @@ def test_a_step_counts_the_same_in_every_minibatch(slope, monkeypatch, tmp_path)
     assert gradients * counts.sum() / 8 == pytest.approx(counts, rel=1e-4)
 
 
+@pytest.mark.parametrize("explosion", [lambda w: 1e5 * w, lambda w: (w - w.detach()).sqrt()], ids=["huge", "infinite"])
+def test_a_gradient_that_explodes_moves_nothing(explosion, tmp_path):
+    data, net, calls = (np.zeros((64, 7)), np.arange(0, 65, 8)), torch.nn.Linear(1, 1, bias=False), []
+    before = net.weight.item()
+
+    def loss(*batch):  # the first of four mini-batches, both halves of it, is as usual
+        calls.append(batch)
+        return (net.weight if len(calls) <= 2 else explosion(net.weight)).sum()
+
+    assert supervised.fit(run_in(tmp_path), net, loss, lambda: None, data, data, seed=0, sequences=2, epochs=1, lr=1e-3,
+                          lr_end=1e-3, grad_norm=1.0, validation=8, optimizer="adam", fresh=True)
+    assert net.weight.item() == pytest.approx(before - 1e-3, abs=1e-6)
+
+
 @pytest.mark.parametrize("fresh", [True, False])
 def test_noise_is_drawn_afresh_in_every_epoch_or_once_a_trajectory(fresh, monkeypatch, tmp_path):
     lengths = np.arange(20, 84)
