@@ -30,7 +30,7 @@ PRESETS = {
                   eval_every=3, eval_episodes=16, resume_every=2, tolerance=4.0, near_share=0.5,
                   world=World(time_limit=4.0)),
     "quick": _QUICK | dict(updates=500, checkpoints=26),
-    "laptop": _QUICK | dict(world=World(mass=(1.0, 5.0)), updates=1500, kl_target_end=0.005, lr_min=2e-5, checkpoints=100),
+    "laptop": _QUICK | dict(world=World(mass=(1.0, 5.0)), updates=3000, kl_target_end=0.005, lr_min=2e-5, checkpoints=100),
     "paper": dict(tolerance=4.0, near_share=0.8),  # without: nothing learned in 10 million steps (results/README.md)
 }
 

@@ -17,7 +17,7 @@ from common.task import C_060, World
 from common.weights import save_tensors
 
 ROOT = Path(__file__).parent.parent
-RECIPE = {"01_train_privileged": ["--mass", "3", "3.5"],  # of the nets that pretrained/next replaces
+RECIPE = {"01_train_privileged": ["--mass", "3", "3.5", "--updates", "1500"],  # of the nets that pretrained/next replaces
           "03_train_estimator": ["--sizes", "128", "256", "256", "--lr", "4e-3", "--epochs", "10"]}
 RECORDS = [path.parent.relative_to(ROOT / "pretrained") for path in sorted((ROOT / "pretrained").rglob("config.json"))]
 PUBLISHED = [folder for folder in RECORDS if folder.parts[0] != "next"]
