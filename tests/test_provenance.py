@@ -93,8 +93,7 @@ def test_every_published_run_has_the_settings_of_its_preset(folder, tmp_path):
     stage, *method, seed = folder.parts
     module = importlib.import_module(stage)
     options = ["--method", *method] * bool(method) + ["--seed", seed[4:], "--out", str(tmp_path)]
-    if root.name != "next":
-        options += RECIPE.get(stage, [])
+    options += RECIPE.get(stage, []) if root.name == "pretrained" else []
     cfg, reads = command.parse(module.Config, module.PRESETS, "", ["laptop", *options]), None
     if stage.startswith("04"):
         cfg = module.with_sizes(cfg)
