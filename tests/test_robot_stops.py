@@ -108,6 +108,19 @@ def test_the_mean_of_a_control_step_is_as_noisy_as_the_training_worlds_force():
     assert abs(np.corrcoef(np.ravel(means[:-1]), np.ravel(means[1:]))[0, 1]) < 0.15
 
 
+def test_the_heaviest_box_of_the_study_may_be_struck():
+    arm, readings = placed(), []
+    arm.worlds.place(np.arange(1), np.zeros((1, 3)), np.array([[-0.1, 0.0]]), {"mass": 5.0, "restitution": 0.7})
+    read = arm.read_wrench
+    arm.read_wrench = lambda: (readings.append(read()), readings[-1])[1]
+    with controller.Controller(safety.Guarded(arm), threaded=False) as drive:
+        for _ in range(20):
+            drive.aim(np.array([task.MAX_SPEED, 0.0]))
+            drive.tick()
+    struck = max(np.linalg.norm(force) for _, force in readings)
+    assert 5.0 * 1.7 * task.MAX_SPEED * ik.QP_RATE < struck < safety.PEAK
+
+
 def test_the_first_target_comes_a_step_after_the_first_sight_not_two(robot, monkeypatch):
     module, order = importlib.import_module("06_robot"), []
     for room, name in ((module, "sense"), (module, "think"), (controller.Controller, "tick"), (controller.Controller, "aim")):
