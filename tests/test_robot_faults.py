@@ -80,6 +80,12 @@ class Forced(Faulty):
         return time, force + [45.0 * self.wrong, 0, 0]
 
 
+class Struck(Faulty):
+    def read_wrench(self):
+        time, force = super().read_wrench()
+        return time, force + [200.0 * (len(self.commands) == 26), 0, 0]
+
+
 class JointAtLimit(Faulty):
     def read_joints(self):
         return self.time, np.where(self.wrong * (np.arange(len(self.joints)) == 3), -self.model.limits, self.joints)
@@ -130,6 +136,7 @@ class CtrlC(Faulty):
 
 FAULTS = {JointsNaN: "joint angles", WrenchNaN: "wrench", ImageTimeNaN: "camera", CameraFrozen: "frozen",
           CameraStuck: "camera: the newest is", CameraGone: "no image", WrenchOld: "wrench: the newest is", Forced: "over 40 N",
+          Struck: "N in one reading, over 150 N",
           JointAtLimit: "joint 4 is at its limit", Beyond: "beyond the border", JointsOld: "wrench: the newest is -",
           TooFast: "is over its speed", JointsStuck: "the same, while they are told to move",
           Lifted: "above its height", Broken: "BrokenPipeError in test_robot_faults.py", CtrlC: "Ctrl-C"}

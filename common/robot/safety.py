@@ -163,8 +163,8 @@ class Guarded:
         self._check_age("wrench", time, SENSOR_AGE)
         self._forces.append(np.array(force, float))
         mean, peak = np.linalg.norm(self.force), np.linalg.norm(force)
-        self.require(mean <= FORCE and peak <= PEAK,
-                     f"force of {mean:.0f} N (limit {FORCE:.0f}), in one reading {peak:.0f} N (limit {PEAK:.0f})")
+        self.require(mean <= FORCE, f"force of {mean:.0f} N, over {FORCE:.0f} N")
+        self.require(peak <= PEAK, f"force of {peak:.0f} N in one reading, over {PEAK:.0f} N")
 
     @property
     def force(self):
