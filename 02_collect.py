@@ -75,7 +75,7 @@ def main(cfg):
     if not 0 <= cfg.drifting <= 1:
         raise UserError(f"--drifting {cfg.drifting}: a share, 0 to 1")
     if cfg.seed:
-        raise UserError(f"--seed {cfg.seed}: the later stages read seed 0's trajectories; for other ones take another --out")
+        raise UserError(f"--seed {cfg.seed}: only 0, the later stages read seed 0's trajectories")
     folder = runs.find(cfg, "01_train_privileged", "policy.safetensors").parent
     names = [name for name in runs.record_of(cfg, folder)["outputs"] if name.startswith("checkpoint_")]
     paths = [runs.find(cfg, "01_train_privileged", name) for name in sorted(names)]

@@ -134,8 +134,9 @@ def other_worlds(results):
     methods = list(next(iter(worlds.values())))
     rows = [[row, *(percent(rates[m]) if m in rates else "" for m in methods)]
             for row, rates in ({"as trained": results["success_rate"]} | worlds).items()]
-    episodes = next(iter(worlds.values()))[methods[0]]["episodes"]
-    title = f"Success in other worlds, one thing changed at a time, {episodes:,} episodes each"
+    episodes, all_of_them = (rates[methods[0]]["episodes"] for rates in (next(iter(worlds.values())), results["success_rate"]))
+    title = (f"Success in other worlds, one thing changed at a time, the list's first {episodes:,} episodes each (as trained: "
+             f"{all_of_them:,})")
     return titled(title, ["world", *methods], rows)
 
 
