@@ -128,15 +128,15 @@ def occlusion_duration(results):
 
 def other_worlds(results):
     """Success where one thing is other than in training; the first row is the fixed list of sec. 5.2."""
-    worlds = results.get("other_worlds")
+    worlds, trained = results.get("other_worlds"), results["success_rate"]
     if not worlds:
         return ""
-    methods = list(next(iter(worlds.values())))
+    first = next(iter(worlds.values()))
+    methods = list(first)
     rows = [[row, *(percent(rates[m]) if m in rates else "" for m in methods)]
-            for row, rates in ({"as trained": results["success_rate"]} | worlds).items()]
-    episodes, all_of_them = (rates[methods[0]]["episodes"] for rates in (next(iter(worlds.values())), results["success_rate"]))
-    title = (f"Success in other worlds, one thing changed at a time, the list's first {episodes:,} episodes each (as trained: "
-             f"{all_of_them:,})")
+            for row, rates in ({"as trained": trained} | worlds).items()]
+    title = (f"Success in other worlds, one thing changed at a time, the list's first {first[methods[0]]['episodes']:,} episodes "
+             f"each (as trained: {trained[methods[0]]['episodes']:,})")
     return titled(title, ["world", *methods], rows)
 
 
