@@ -21,8 +21,9 @@ if ! cmp -s requirements.txt .venv/installed.txt; then
 fi
 
 if [ "$what" = test ]; then
-    .venv/bin/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --ignore tests/test_robot_stops.py
-    exec .venv/bin/python -m pytest -q tests/test_robot_stops.py  # times and signals: alone
+    alone=(tests/test_robot_thread.py tests/test_robot_stops.py)  # times and signals
+    .venv/bin/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder "${alone[@]/#/--ignore=}"
+    exec .venv/bin/python -m pytest -q "${alone[@]}"
 fi
 scripts=(0*.py)
 [ "$what" != pretrained ] || scripts=(05*.py 06*.py)

@@ -16,6 +16,7 @@ sys.path.insert(0, str(ROOT))
 from six_joints import SIX  # noqa: E402
 
 from common import command, networks, runs, speed, weights  # noqa: E402
+from common.robot import controller  # noqa: E402
 from common.robot.iiwa import IIWA  # noqa: E402
 from common.task import World  # noqa: E402
 
@@ -143,3 +144,15 @@ def metrics(folder):
     """metrics.csv without the speed."""
     with open(folder / "metrics.csv") as file:
         return [{key: x for key, x in row.items() if key != "steps_per_s"} for row in csv.DictReader(file)]
+
+
+@pytest.fixture
+def nobody(monkeypatch):
+    """At the terminal: who places the box has done so."""
+    monkeypatch.setattr("builtins.input", lambda words: None)
+
+
+@pytest.fixture
+def patient(monkeypatch):
+    """On a busy machine a target may be late."""
+    monkeypatch.setattr(controller, "SILENCE", 1.0)

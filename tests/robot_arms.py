@@ -30,6 +30,20 @@ class Driver:
             setattr(self, name, lambda read=getattr(self.simulated, name): (time.monotonic(), read()[1]))
 
 
+class Taped(Driver):
+    """A real arm that notes when it was told what: `tape` of (time, moving or not). `last` is the one that was made last."""
+
+    def __init__(self, config=None):
+        super().__init__(config)
+        Taped.last, self.tape = self, []
+        drive, stop = self.command, self.stop
+        self.command = lambda velocity: (self.tape.append((time.monotonic(), bool(velocity.any()))), drive(velocity))
+        self.stop = lambda: (self.tape.append((time.monotonic(), False)), stop(), self.stopped())
+
+    def stopped(self):
+        """For a test to see."""
+
+
 def stopped_for_good(arm):
     before = arm.joints.copy()
     arm.command(np.full(7, 0.1))

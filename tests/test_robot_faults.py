@@ -10,7 +10,7 @@ import pytest
 from robot_arms import Driver, mistakes, placed, stopped_for_good
 from six_joints import SIX
 
-from common import belief
+from common import belief, task
 from common.robot import controller, hardware, ik, safety
 from common.robot.iiwa import IIWA
 
@@ -274,3 +274,16 @@ def test_a_camera_that_is_left_ends_its_thread_and_gives_the_device_back(monkeyp
     with hardware.VideoCamera("0", 0.0) as camera:
         assert camera.thread.is_alive()
     assert not camera.thread.is_alive() and camera.capture.released
+
+
+def test_the_heaviest_box_of_the_study_may_be_struck():
+    arm, readings = placed(), []
+    arm.worlds.place(np.arange(1), np.zeros((1, 3)), np.array([[-0.1, 0.0]]), {"mass": 5.0, "restitution": 0.7})
+    read = arm.read_wrench
+    arm.read_wrench = lambda: (readings.append(read()), readings[-1])[1]
+    with controller.Controller(safety.Guarded(arm), threaded=False) as drive:
+        for _ in range(20):
+            drive.aim(np.array([task.MAX_SPEED, 0.0]))
+            drive.tick()
+    struck = max(np.linalg.norm(force) for _, force in readings)
+    assert 5.0 * 1.7 * task.MAX_SPEED * ik.QP_RATE < struck < safety.PEAK
