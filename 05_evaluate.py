@@ -2,7 +2,7 @@
 
     python 05_evaluate.py [pretrained|smoke|quick|laptop|paper] [--weights DIR] [--episodes n] [--seed k] [--field value ...]
 
-Reads pi_priv (01), the test set (02), the estimators (03), every finished seed of the policies (04) and the metrics.csv of
+Reads pi_priv (01), the test set (02), every finished seed of the estimators (03) and policies (04) and the metrics.csv of
 all: those in the folder --weights, which is pretrained/ with the preset pretrained, and the others of the same preset. Writes
 runs/<preset>/05_evaluate/seed<k>/: results.json, tables.md, film.mp4, film.gif, and as PNG the figures of sec. 5 and of the
 appendix: success_rate, occlusion_duration, trajectory_with_uncertainty, sim, success_rate_priv, likelihood_loss, mse_loss,
@@ -12,6 +12,7 @@ is new, and no more (measurements/, a file each). Resumes after the last finishe
 import hashlib
 import math
 from collections import defaultdict
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,43 +54,51 @@ PRESETS = {
 
 
 def trained(cfg):
-    """What is there to measure, and names of what is not: {kind: [path]}, {(method, seed): path}, [name].
+    """What is there to measure, and names of what is not: {kind: [path]}, {"kind/seed": [path]} of further seeds,
+    {(method, seed): path}, [name].
 
     Raises UserError: pi_priv is missing, or something is damaged or stale.
     """
     pi_priv = runs.find(cfg, "01_train_privileged", "policy.safetensors")
-    estimators, policies, left_out = {}, {}, []
-    for kind in reversed(ESTIMATORS):  # the order of tab. estimator_ablation
+    estimators, again, policies, left_out = {}, {}, {}, []
+
+    @contextmanager
+    def unless_missing(label, told=True):
         try:
-            estimators[kind] = stacks.find_estimator(cfg, kind)
+            yield
         except runs.Missing:
-            if kind in TRAINED:
-                left_out.append(f"estimator {kind}")
+            left_out.extend([label] * told)
         except runs.Mixed:
-            left_out.append(f"estimator {kind} (of other nets than these)")
+            left_out.append(f"{label} (of other nets than these)")
+
+    def belongs(path):
+        runs.check_lineage(cfg, path.parent, runs.hashes_of(cfg, [pi_priv, *sum(estimators.values(), []), path]))
+        return path
+
+    for kind in reversed(ESTIMATORS):  # the order of tab. estimator_ablation
+        with unless_missing(f"estimator {kind}", kind in TRAINED):
+            estimators[kind] = stacks.find_estimator(cfg, kind)
+    for kind, k in [(kind, k) for kind in TRAINED for k in runs.seeds(cfg.roots, "03_train_estimator", kind) if k]:
+        with unless_missing(f"estimator {kind}, seed {k}"):
+            again[f"{kind}/{k}"] = [belongs(runs.find(cfg, "03_train_estimator", "estimator.safetensors", kind, k))]
     for name, method in METHODS.items():
         stage, folder = ("01_train_privileged", None) if method.training == "pi_priv" else ("04_train_policy", name)
         for k in sorted({*runs.seeds(cfg.roots, stage, folder)} | ({0} if method.published else set())):
-            label = f"{name}, seed {k}" if k else name
-            try:
+            with unless_missing(f"{name}, seed {k}" if k else name):
                 path = runs.find(cfg, stage, "policy.safetensors", folder, k)
                 if method.estimator not in (None, *estimators) or k and (name, 0) not in policies:
                     raise runs.Missing
-                runs.check_lineage(cfg, path.parent, runs.hashes_of(cfg, [pi_priv, *sum(estimators.values(), []), path]))
-                policies[name, k] = path
-            except runs.Missing:
-                left_out.append(label)
-            except runs.Mixed:
-                left_out.append(f"{label} (on other nets than these)")
-    return estimators, policies, left_out
+                policies[name, k] = belongs(path)
+    return estimators, again, policies, left_out
 
 
 def estimator_errors(cfg, players, test, name):
     """Row of tab. estimator_ablation on the test set, or of the filter's table; vision is the pose in o, held when occluded."""
-    section, *row, kind = name.split("/")
+    section, kind = name.split("/", 1)
     data, limit, size = test, cfg.test, 100
     if section == "filter":
-        data, limit, size = test if row == ["test"] else players.trajectories(*row), cfg.filter_trajectories, 1
+        row, kind = kind.split("/")
+        data, limit, size = test if row == "test" else players.trajectories(row), cfg.filter_trajectories, 1
     estimator = players.estimator(None if kind == "vision" else kind)
     progress = bar(min(limit, len(data[1]) - 1), name, unit="trajectory")
 
@@ -185,18 +194,19 @@ def main(cfg):
     if cfg.seed >= 2**22:
         raise UserError(f"--seed {cfg.seed}: say less than {2**22}")
     device = command.device_of(cfg)
-    estimators, policies, left_out = trained(cfg)
+    estimators, again, policies, left_out = trained(cfg)
     test, test_paths = trajectories.load_set(cfg, "test")
-    paths, nets = estimators | policies, {(kind, i): path for kind in estimators for i, path in enumerate(estimators[kind])}
+    nets = {(kind, i): path for kind, paths in (estimators | again).items() for i, path in enumerate(paths)}
     run = runs.Run(cfg, "05_evaluate", nets | policies | test_paths, grows=True)
     if left_out:
         print(f"left out, as not trained to the end, or without their nets: {'; '.join(left_out)}")
-    players, todo = Players(cfg, paths, device, run.world), measurements(cfg, policies, run.world)
+    players, todo = Players(cfg, estimators | again | policies, device, run.world), measurements(cfg, policies, run.world)
     def sha(*paths):
         return [*runs.hashes_of(cfg, paths).values()]
 
     pi_priv, tested = policies["priv_on_state", 0], [kind for kind in estimators if not ESTIMATORS[kind].scaled]
     sources = {f"estimator_ablation/{kind}": sha(*test_paths.values(), *estimators.get(kind, ())) for kind in ("vision", *tested)}
+    sources |= {f"estimator_seeds/{kind}": sha(*test_paths.values(), *paths) for kind, paths in again.items()}
     sources |= {f"filter/{row}/{kind}": sha(*test_paths.values(), pi_priv, *estimators.get(kind, ()))
                 for row in ("test", "drifting", *(row for row in FILTERED if row in other_worlds(run.world)))
                 if cfg.filter_trajectories for kind in ("vision", *tested, "filter")}

@@ -20,10 +20,10 @@ class Players:
         self.estimator, self.trajectories = cache(self.estimator), cache(self.trajectories)
 
     def estimator(self, kind):
-        """Of none, none; "filter" is the particle filter."""
+        """Of none, none; "ours/1" is ours of seed 1, "filter" the particle filter."""
         if kind == "filter":
             return particles.Filters(self.cfg.particles, self.world)
-        return stacks.load_estimator(kind, self.paths[kind], self.device) if kind else None
+        return stacks.load_estimator(kind.partition("/")[0], self.paths[kind], self.device) if kind else None
 
     def chunk(self, m, number):
         """Success (N,), length (N,) and film.Recorded of a chunk: starts, dynamics, noise, occlusions as for all policies."""

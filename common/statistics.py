@@ -58,8 +58,8 @@ def summarise(done):
     measures them.
     """
     results = {"occlusion_duration": {}, "other_worlds": {}}
-    kinds = {"estimator_ablation": dict, "filter": dict, "success_rate": list, "in_the_loop": in_the_loop,
-             "contact_switches": lambda v: spread(v) | {"episodes": len(v)}}
+    kinds = {"estimator_ablation": dict, "estimator_seeds": dict, "filter": dict, "success_rate": list,
+             "in_the_loop": in_the_loop, "contact_switches": lambda v: spread(v) | {"episodes": len(v)}}
     for name, values in done.items():
         *keys, last = name.split("/")
         rows = results
@@ -69,6 +69,9 @@ def summarise(done):
     vision = results["estimator_ablation"]["vision"]
     for row in results["estimator_ablation"].values():
         row |= {f"{key}_of_vision": row[key] / vision[key] for key in MEANS if vision[key]}
+    for kind, by_seed in results.pop("estimator_seeds", {}).items():
+        several = [first := results["estimator_ablation"][kind], *by_seed.values()]
+        first["seeds"] = {key: spread([row[key] for row in several]) for key in MEANS} | {"count": len(several)}
     results["occlusion_loss"] = {method: paired(*(done[f"occlusion_duration/{method}/{name}"] for name in ("0", "full")))
                                  for method in results["occlusion_duration"]}
 

@@ -56,9 +56,12 @@ def estimator_ablation(results):
     for kind, e in results["estimator_ablation"].items():
         share = ", ".join(f"{e[f'{key}_of_vision']:.1%}" for key in MEANS if f"{key}_of_vision" in e)
         parts = [", ".join(f"{e[part][key]:.2f}" for key in MEANS) if part in e else "" for part in ("seen", "occluded")]
-        rows.append([kind, *(f"{e[key]:.2f}" for key in ERRORS), share, *parts])
+        s = e.get("seeds")
+        seeds = f"{', '.join('{mean:.2f} +- {std:.2f}'.format(**s[key]) for key in MEANS)} ({s['count']})" if s else ""
+        rows.append([kind, *(f"{e[key]:.2f}" for key in ERRORS), share, *parts, seeds])
     title = "Errors of the estimators on the test set (tab. estimator_ablation); in pairs: mean L2 (mm), mean abs. (deg)"
-    header = ["estimator", "L2 (mm)", "RMSE (mm)", "abs. (deg)", "RMSE (deg)", "of vision", "seen", "occluded"]
+    header = ["estimator", "L2 (mm)", "RMSE (mm)", "abs. (deg)", "RMSE (deg)", "of vision", "seen", "occluded",
+              "mean +- std (seeds)"]
     return titled(title, header, rows)
 
 

@@ -57,12 +57,14 @@ def test_a_method_is_one_entry_and_05_measures_only_what_is_new(study, extended,
 
     shutil.copytree(own / "04_train_policy/mine/seed0", own / "04_train_policy/mine/seed7")
     shutil.copytree(study / "smoke/04_train_policy/est", own / "04_train_policy/est")
+    shutil.copytree(own / "03_train_estimator/ours/seed0", own / "03_train_estimator/ours/seed4")
     before = {*kept.rglob("*.json")}
     assert "or without their nets: est_mse; behavior_cloning\n" in extended("05_evaluate")
     new = {path.parent.relative_to(kept).as_posix() for path in {*kept.rglob("*.json")} - before}
-    assert new == {"success_rate/mine/7", "success_rate/est/0", "in_the_loop/est", *(
+    assert new == {"estimator_seeds/ours/4", "success_rate/mine/7", "success_rate/est/0", "in_the_loop/est", *(
         f"occlusion_duration/est/{seconds}" for seconds in ("0", "2.5", "5", "10", "full"))}
-    assert json.loads(results.read_text())["success_rate"]["mine"]["seeds"]["count"] == 2
+    told = json.loads(results.read_text())
+    assert told["success_rate"]["mine"]["seeds"]["count"] == told["estimator_ablation"]["ours"]["seeds"]["count"] == 2
 
 
 def test_05_measures_pi_priv_alone_where_nothing_else_is_trained(study, extended, tmp_path):
