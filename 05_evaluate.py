@@ -75,7 +75,7 @@ def trained(cfg):
         runs.check_lineage(cfg, path.parent, runs.hashes_of(cfg, [pi_priv, *sum(estimators.values(), []), path]))
         return path
 
-    for kind in reversed(ESTIMATORS):  # the order of tab. estimator_ablation
+    for kind in sorted(reversed(ESTIMATORS), key=lambda kind: kind not in TRAINED):  # the order of tab. estimator_ablation
         with unless_missing(f"estimator {kind}", kind in TRAINED):
             estimators[kind] = stacks.find_estimator(cfg, kind)
     for kind, k in [(kind, k) for kind in TRAINED for k in runs.seeds(cfg.roots, "03_train_estimator", kind) if k]:
