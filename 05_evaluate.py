@@ -42,7 +42,7 @@ class Config(command.Reader):
 
 
 PRESETS = {
-    "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, other_episodes=100, passes=10, num_envs=200,
+    "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, other_episodes=None, passes=10, num_envs=200,
                        filter_trajectories=None, weights=Path(__file__).parent / "pretrained"),
     "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, other_episodes=None, passes=2, test=12,
                   num_envs=16, filter_trajectories=1, particles=10),
