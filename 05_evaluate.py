@@ -80,7 +80,10 @@ def trained(cfg):
             estimators[kind] = stacks.find_estimator(cfg, kind)
     for kind, k in [(kind, k) for kind in TRAINED for k in runs.seeds(cfg.roots, "03_train_estimator", kind) if k]:
         with unless_missing(f"estimator {kind}, seed {k}"):
-            again[f"{kind}/{k}"] = [belongs(runs.find(cfg, "03_train_estimator", "estimator.safetensors", kind, k))]
+            path = runs.find(cfg, "03_train_estimator", "estimator.safetensors", kind, k)
+            if kind not in estimators:
+                raise runs.Missing
+            again[f"{kind}/{k}"] = [belongs(path)]
     for name, method in METHODS.items():
         stage, folder = ("01_train_privileged", None) if method.training == "pi_priv" else ("04_train_policy", name)
         for k in sorted({*runs.seeds(cfg.roots, stage, folder)} | ({0} if method.published else set())):

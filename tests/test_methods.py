@@ -70,8 +70,10 @@ def test_a_method_is_one_entry_and_05_measures_only_what_is_new(study, extended,
 def test_05_measures_pi_priv_alone_where_nothing_else_is_trained(study, extended, tmp_path):
     for stage in ("01_train_privileged", "02_collect"):
         shutil.copytree(study / "smoke" / stage, tmp_path / "runs/smoke" / stage)
+    shutil.copytree(study / "smoke/03_train_estimator/ours/seed0", tmp_path / "runs/smoke/03_train_estimator/ours/seed4")
     stdout = extended("05_evaluate")
-    assert "their nets: estimator mse; estimator likelihood; estimator ours; est_uncertainty; est" in stdout
+    assert "; estimator ours; estimator ours, seed 4; est_uncertainty; est" in stdout
+    assert "their nets: estimator mse; estimator likelihood; estimator ours;" in stdout
     assert json.loads((tmp_path / "runs/smoke/05_evaluate/seed0/results.json").read_text())["success_rate"].keys() == {
         "priv_on_state"}
 
