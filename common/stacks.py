@@ -65,6 +65,7 @@ METHODS = {
     "priv_on_state": Method(r"$\pi_{priv}(s)$", "s", None, "pi_priv"),
     "est_likelihood": Method(r"$\pi_{est}$, likelihood", "s_hat, sigma", "likelihood", "rl", published=False),
     "est_ensemble": Method(r"$\pi_{est}$, ensemble", "s_hat, sigma", "ensemble", "rl", published=False),
+    "est_ensemble_mean": Method(r"$\pi_{est}(\hat{s})$, ensemble", "s_hat", "ensemble", "rl", published=False),
     "est_scaled": Method(r"$\pi_{est}$, scaled sigma", "s_hat, sigma", "ours_scaled", "rl", published=False),
 }
 TRAINED = {name: kind for name, kind in ESTIMATORS.items() if not kind.nets}  # by 03
