@@ -76,6 +76,7 @@ def parse(config_class: type, presets: dict[str, dict], doc: str, args: list[str
             raise
         # tyro frames its message, with a rule below it and more help below that
         message = box.getvalue().partition("\n")[2].partition("│ ─")[0].replace("│", " ").strip().rstrip(".")
+        message = message.removeprefix("Error parsing world: ")
         raise UserError(f"{message}; see {script} {preset} --help") from None
     if cfg.weights and not any(cfg.weights.glob("0*/**/config.json")):
         raise UserError(f"--weights {cfg.weights}: no run is in there; say pretrained, or the runs/<preset> of a study")

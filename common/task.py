@@ -71,6 +71,9 @@ class World:
     late, gain, surface = 0, 1.0, 2.0  # see Other
 
     def __post_init__(self):
+        for name, value in vars(self).items():
+            if name != "starts" and not np.isfinite(value).all():
+                raise ValueError(f"--{name.replace('_', '-')} {value}: finite numbers")
         diagonal = float(np.hypot(*self.box[:2]))
         if min(self.box) <= 0 or diagonal >= min(WORKSPACE):
             raise ValueError(f"--box {self.box}: of its diagonal, {diagonal:.2f} m, the workspace leaves no room to start")
@@ -80,6 +83,8 @@ class World:
             if not 0 <= low <= high <= most or name == "mass" and not low:
                 upper = f", up to {most:g}" if name in largest else ""
                 raise ValueError(f"--{name.replace('_', '-')} {low} {high}: a range, the least first{upper}")
+        if not RADIUS <= self.pusher_height <= self.box[2]:
+            raise ValueError(f"--pusher-height {self.pusher_height}: in m, from the pusher's radius, {RADIUS}, to the box's height")
         if not self.max_force > 0:
             raise ValueError(f"--max-force {self.max_force}: above 0")
         if not 1 <= self.time_limit <= 3600:

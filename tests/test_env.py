@@ -103,6 +103,8 @@ def test_observations_clip_at_the_worlds_force():
     ({"mass": (2.0, 1.0)}, "--mass 2.0 1.0"), ({"mass": (0.0, 1.0)}, "--mass"), ({"support": (0.5, 0.2)}, "--support"),
     ({"mu_dynamic": (-0.1, 0.2)}, "--mu-dynamic"), ({"support_offset": (0.1, 0.0)}, "--support-offset"),
     ({"support": (0.0, 2.0)}, "up to 1"), ({"support_offset": (0.0, 0.06)}, "up to 0.05"),
+    ({"box": (0.12, np.nan, 0.07)}, "--box"), ({"noise": (np.inf, 0, 0, 0, 0)}, "--noise"),
+    ({"pusher_height": 0.08}, "--pusher-height"), ({"pusher_height": 0.01}, "--pusher-"),
     ({"restitution": (0.0, 2.0)}, "up to 1"), ({"occlusion_start": 2.0}, "at most 1"),
     ({"time_limit": 0.5}, "--time-limit 0.5: in s, 1 to 3600"), ({"time_limit": np.nan}, "--time-limit nan")])
 def test_no_such_world(changes, words):

@@ -42,7 +42,7 @@ class Arm(Protocol):
 
 @dataclass
 class Gaps:
-    """What the simulated arm has and the training world has not; the force's errors are of that world's size."""
+    """What the simulated arm has and the training world has not; the force's errors are as large as the study's."""
 
     latency: float = 1.0  # camera latency in frames of 1/15 s
     hand_eye_mm: float = 1.0  # standard deviation of the calibrated camera position in mm, drawn once a run
