@@ -171,14 +171,14 @@ def occlusion_duration(results, path):
 
 def other_worlds(results, path):
     """Success, with Wilson intervals, in each of the other worlds; results as in results.json."""
-    rows = {"as trained": results["success_rate"]} | results["other_worlds"]
-    methods = next(iter(results["other_worlds"].values()))
-    figure, ax = new(7, 1.2 + 0.3 * len(rows))
+    rows = results["other_worlds"]
+    methods = rows["as trained"]
+    figure, ax = new(7, 1.2 + 0.05 * len(methods) * len(rows))
     for i, method in enumerate(methods):
         name, color, marker = style(method)
         y, points = zip(*((k, rates[method]) for k, rates in enumerate(rows.values()) if method in rates))
         mean, low, high = (100 * np.array([p[key] for p in points]) for key in ("mean", "low", "high"))
-        offset = 0.13 * (i - (len(methods) - 1) / 2)  # one below the other, so that no bar hides another
+        offset = 0.8 * ((i + 0.5) / len(methods) - 0.5)  # one below the other, so that no bar hides another
         ax.errorbar(mean, np.array(y) + offset, xerr=(mean - low, high - mean), color=color, marker=marker, ls="", ms=4,
                     elinewidth=1, label=name)
     ax.set_yticks(range(len(rows)), rows)

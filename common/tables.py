@@ -130,16 +130,12 @@ def occlusion_duration(results):
 
 
 def other_worlds(results):
-    """Success where one thing is other than in training; the first row is the fixed list of sec. 5.2."""
-    worlds, trained = results.get("other_worlds"), results["success_rate"]
-    if not worlds:
+    """Success where one thing is other than in training, beside that in training on the same episodes."""
+    if not (worlds := results.get("other_worlds")):
         return ""
-    first = next(iter(worlds.values()))
-    methods = list(first)
-    rows = [[row, *(percent(rates[m]) if m in rates else "" for m in methods)]
-            for row, rates in ({"as trained": trained} | worlds).items()]
-    title = (f"Success in other worlds, one thing changed at a time, the list's first {first[methods[0]]['episodes']:,} episodes "
-             f"each (as trained: {trained[methods[0]]['episodes']:,})")
+    methods = list(trained := worlds["as trained"])
+    rows = [[row, *(percent(rates[m]) if m in rates else "" for m in methods)] for row, rates in worlds.items()]
+    title = f"Success in other worlds, one thing changed at a time, the list's first {trained[methods[0]]['episodes']:,} episodes"
     return titled(title, ["world", *methods], rows)
 
 
