@@ -42,7 +42,7 @@ def measurements(cfg, policies, world):
         todo |= {f"starts/{other.starts}/{m}": Measurement(m, cfg.episodes, world=other) for other in others}
         todo[f"contact_switches/{m}"] = Measurement(m, cfg.switch_episodes, switches=True)
     todo |= {f"other_worlds/{row}/{m}": Measurement(m, cfg.other_episodes, world=other)
-             for row, other in (other_worlds(world).items() if cfg.other_episodes else ()) for m in methods
+             for row, other in ({"as trained": world} | other_worlds(world)).items() if cfg.other_episodes for m in methods
              if METHODS[m].estimator or METHODS[m].reads == "s" and not row.startswith(SENSED)}
     todo |= {f"in_the_loop/{m}": Measurement(m, cfg.episodes, errors=True) for m in methods if METHODS[m].estimator}
     todo |= {f"filter_loop/{name}/{m}": Measurement(m, 2 * cfg.filter_trajectories, filtered=name == "filter", worlds=1)

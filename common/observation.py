@@ -10,10 +10,10 @@ class ObservationModel:
     """What camera and force sensor report of `num` true states, step by step.
 
     Correlated noise (the bias) is drawn per episode, uncorrelated noise per step, and occlusions, all as in `world`. An
-    occlusion holds the last noisy box pose, bit for bit, with xi at 1, for a normal time as `world` says, or for `occlusion` s: 0 for
-    none, math.inf for "until the end". The pusher is exact. In a task.Other the camera may be late and the force have a gain. Each
-    `step` takes the same number of draws from its own stream, whatever the states are: with the same seed noise and
-    occlusions of the same step are the same, up to the first `reset`.
+    occlusion holds the last noisy box pose, bit for bit, with xi at 1, for a normally distributed time as `world` says, or for
+    `occlusion` s: 0 for none, math.inf for "until the end". The pusher is exact. In a task.Other the camera may be late and the
+    force have a gain. Each `step` takes the same number of draws from its own stream, whatever the states are: with the same
+    seed noise and occlusions of the same step are the same, up to the first `reset`.
     """
 
     def __init__(self, num, seed=0, occlusion=None, world=World()):

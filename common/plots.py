@@ -173,7 +173,7 @@ def other_worlds(results, path):
     """Success, with Wilson intervals, in each of the other worlds; results as in results.json."""
     rows = results["other_worlds"]
     methods = rows["as trained"]
-    figure, ax = new(7, 1.2 + 0.05 * len(methods) * len(rows))
+    figure, ax = new(7, 1.2 + max(0.2, 0.05 * len(methods)) * len(rows))
     for i, method in enumerate(methods):
         name, color, marker = style(method)
         y, points = zip(*((k, rates[method]) for k, rates in enumerate(rows.values()) if method in rates))

@@ -58,8 +58,6 @@ def summarise(done):
     measures them.
     """
     results = {"occlusion_duration": {}, "other_worlds": {}}
-    first = {m: len(done[name]) for name in done for section, _, m in [name.rpartition("/")] if section.startswith("other_worlds/")}
-    done = {f"other_worlds/as trained/{m}": done[f"success_rate/{m}/0"][:count] for m, count in first.items()} | done
     kinds = {"estimator_ablation": dict, "estimator_seeds": dict, "filter": dict, "success_rate": list,
              "in_the_loop": in_the_loop, "contact_switches": lambda v: spread(v) | {"episodes": len(v)}}
     for name, values in done.items():

@@ -130,7 +130,7 @@ def occlusion_duration(results):
 
 
 def other_worlds(results):
-    """Success where one thing is other than in training, beside that in training on the same episodes."""
+    """Success where one thing is other than in training, beside that in the world as trained, on the same episodes."""
     if not (worlds := results.get("other_worlds")):
         return ""
     methods = list(trained := worlds["as trained"])

@@ -84,7 +84,7 @@ class World:
                 upper = f", up to {most:g}" if name in largest else ""
                 raise ValueError(f"--{name.replace('_', '-')} {low} {high}: a range, the least first{upper}")
         if not RADIUS <= self.pusher_height <= self.box[2]:
-            raise ValueError(f"--pusher-height {self.pusher_height}: in m, from the pusher's radius, {RADIUS}, to the box's height")
+            raise ValueError(f"--pusher-height {self.pusher_height}: in m, from its radius, {RADIUS}, to the box's height")
         if not self.max_force > 0:
             raise ValueError(f"--max-force {self.max_force}: above 0")
         if not 1 <= self.time_limit <= 3600:

@@ -11,24 +11,26 @@ from common.files import UserError
 from common.progress import bar
 
 # The curriculum lowers the tolerance by 5 % when of the last 512 episodes without aid, which tell a rate within 2 points, 60 %
-# succeed: often enough to be found at the next tolerance too, and seldom enough that there is more to learn. Where so many never
-# do, as some starts cannot be solved, it falls all the same in the third quarter of the training: the last is for the task itself
+# succeed: often enough to be found at the next tolerance too, and seldom enough that there is more to learn. Where 60 % are
+# out of reach, as some starts cannot be solved, it falls in the third quarter of the training: the last is for the task itself
 EPISODES, SHARE, FACTOR = 512, 0.6, 0.95
 CURRICULUM = ("tolerance", "episodes", "successes")  # its state, as `lowered` takes it
 STATS = ("train_success", "train_return", "train_length", "policy_loss", "clip_fraction", "kl", "entropy", "value_loss",
          "explained", "lr", "steps_per_s")  # of an update, in metrics.csv
 
 
-def lowered(tolerance, ended, successes, most=math.inf):
-    """The curriculum's factor on the success tolerance, and the episodes and successes counted since it was looked at."""
+def lowered(tolerance, ended, successes, limit=math.inf):
+    """The curriculum's factor on the success tolerance, at most `limit`, and the episodes and successes counted since it was
+    looked at.
+    """
     if ended < EPISODES:
-        return min(most, tolerance), ended, successes
-    return min(most, max(1.0, FACTOR * tolerance) if successes > SHARE * ended else tolerance), 0, 0
+        return min(limit, tolerance), ended, successes
+    return min(limit, max(1.0, FACTOR * tolerance) if successes > SHARE * ended else tolerance), 0, 0
 
 
-def most(tolerance, done):
-    """The largest factor on the success tolerance, that begins at `tolerance`, where a share `done` of the training is."""
-    return tolerance ** min(1.0, max(0.0, 3 - 4 * done))
+def limit(first, done):
+    """The curriculum's largest factor after a share `done` of the training: the `first` up to a half, 1 from three quarters."""
+    return first ** min(1.0, max(0.0, 3 - 4 * done))
 
 
 def ended_episodes(batch, running):
@@ -125,7 +127,7 @@ def train(run, hp, env, held_out, actor, critic, keep=None):
         if not math.isfinite(stats["kl"] + stats["value_loss"]):
             raise UserError(f"{run.dir}: training diverged in update {k + 1}: use a lower rate, and --force")
         curriculum = lowered(curriculum[0], curriculum[1] + ended, curriculum[2] + successes,
-                             most(hp.tolerance, (k + 1) / hp.updates))
+                             limit(hp.tolerance, (k + 1) / hp.updates))
         stats["steps_per_s"] = hp.num_envs * hp.rollout_steps / (time.perf_counter() - clock)
         shown = "-" if math.isnan(success) else f"{success:.1%}"  # not measured again yet
         progress.set_postfix_str(f"success {shown}, tolerance {curriculum[0]:.2f}x, {stats['steps_per_s']:,.0f} steps/s",

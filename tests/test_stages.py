@@ -180,11 +180,9 @@ def test_other_worlds_are_played_by_every_policy_that_estimates(copy, call, monk
     results = json.loads((out / "smoke/05_evaluate/seed0/results.json").read_text())
     estimating = {"est_uncertainty", "est", "est_mse", "priv_on_estimate"}
     assert results["other_worlds"].keys() == {
-        "as trained", "c=0.042", "c=0.060", "c=0.078", "support_offset=8mm", "mass=1-1.5", "mass=5-6", "mu=0.05-0.1", "mu=0.3-0.6",
-        "mu_pusher=0.6-0.9", "box=-2cm", "box=+2cm", "box=+2cm_wide", "noise=2x", "bias=2x", "force=0.7x", "force=1.3x",
-        "late=1", "late=2", "surface=1.5", "surface=4", "time=30s"}
-    played = json.loads(next((out / "smoke/05_evaluate/seed0/measurements/success_rate/est/0").iterdir()).read_text())
-    assert results["other_worlds"]["as trained"]["est"]["mean"] == sum(played[:2]) / 2  # of the same episodes
+        "as trained", "c=0.042", "c=0.060", "c=0.078", "support_offset=8mm", "mass=1-1.5", "mass=5-6", "mu=0.05-0.1",
+        "mu=0.3-0.6", "mu_pusher=0.6-0.9", "box=-2cm", "box=+2cm", "box=+2cm_wide", "noise=2x", "bias=2x", "force=0.7x",
+        "force=1.3x", "late=1", "late=2", "surface=1.5", "surface=4", "time=30s"}
     for row, rates in results["other_worlds"].items():
         sensing = row.partition("=")[0] in ("noise", "bias", "force", "late")
         assert rates.keys() == (estimating if sensing else estimating | {"priv_on_state"})

@@ -23,8 +23,8 @@ def test_the_tolerance_is_lowered_as_episodes_succeed(tolerance, ended, successe
 
 
 def test_the_tolerance_is_down_in_time_where_too_few_ever_succeed():
-    assert [training.most(4.0, done) for done in (0, 0.5, 0.625, 0.75, 1)] == pytest.approx([4, 4, 2, 1, 1])
-    assert training.most(1.0, 0) == 1
+    assert [training.limit(4.0, done) for done in (0, 0.5, 0.625, 0.75, 1)] == pytest.approx([4, 4, 2, 1, 1])
+    assert training.limit(1.0, 0) == 1
     assert training.lowered(3.5, 10, 0, 2.0) == (2.0, 10, 0) and training.lowered(3.5, 512, 0, 2.0) == (2.0, 0, 0)
 
 
