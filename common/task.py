@@ -79,13 +79,13 @@ class World:
             raise ValueError(f"--box {self.box}: of its diagonal, {diagonal:.2f} m, the workspace leaves no room to start")
         largest = {"restitution": 1.0, "support": 1.0, "support_offset": min(self.box[:2]) / 2}
         for name in (*DRAWN, "support", "support_offset"):
-            (low, high), most = getattr(self, name), largest.get(name, np.finfo(float).max)
+            (low, high), most = getattr(self, name), largest.get(name, np.inf)
             if not 0 <= low <= high <= most or name == "mass" and not low:
                 upper = f", up to {most:g}" if name in largest else ""
                 raise ValueError(f"--{name.replace('_', '-')} {low} {high}: a range, the least first{upper}")
         if not RADIUS <= self.pusher_height <= self.box[2]:
             raise ValueError(f"--pusher-height {self.pusher_height}: in m, from its radius, {RADIUS}, to the box's height")
-        if not self.max_force > 0:
+        if self.max_force <= 0:
             raise ValueError(f"--max-force {self.max_force}: above 0")
         if not 1 <= self.time_limit <= 3600:
             raise ValueError(f"--time-limit {self.time_limit}: in s, 1 to 3600")

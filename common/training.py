@@ -19,17 +19,18 @@ STATS = ("train_success", "train_return", "train_length", "policy_loss", "clip_f
          "explained", "lr", "steps_per_s")  # of an update, in metrics.csv
 
 
-def lowered(tolerance, ended, successes, limit=math.inf):
-    """The curriculum's factor on the success tolerance, at most `limit`, and the episodes and successes counted since it was
+def lowered(tolerance, ended, successes, highest=math.inf):
+    """The curriculum's factor on the success tolerance, at most `highest`, and the episodes and successes counted since it was
     looked at.
     """
-    if ended < EPISODES:
-        return min(limit, tolerance), ended, successes
-    return min(limit, max(1.0, FACTOR * tolerance) if successes > SHARE * ended else tolerance), 0, 0
+    if ended >= EPISODES:
+        tolerance = max(1.0, FACTOR * tolerance) if successes > SHARE * ended else tolerance
+        ended = successes = 0
+    return min(highest, tolerance), ended, successes
 
 
 def limit(first, done):
-    """The curriculum's largest factor after a share `done` of the training: the `first` up to a half, 1 from three quarters."""
+    """The curriculum's highest factor after a share `done` of the training: the `first` up to a half, 1 from three quarters."""
     return first ** min(1.0, max(0.0, 3 - 4 * done))
 
 
