@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
-from common import networks, ppo, ranks, speed, stacks, task, training  # noqa: E402
+from common import networks, particles, ppo, ranks, speed, stacks, task, training, trajectories  # noqa: E402
 from common.env import PushEnv, PushVectorEnv  # noqa: E402
 from common.observation import ObservationModel, Observed  # noqa: E402
 
@@ -138,6 +138,11 @@ def main():
         for passes in (1, 4, 10, 50):
             stack = stacks.make(stacks.METHODS["est_uncertainty"], WORLDS, estimator, passes)
             line(f"{name} estimator in the loop, all included, M = {passes}, {WORLDS} worlds", rate(*play(stack, 2)))
+    folder = Path(__file__).parent.parent / "pretrained/02_collect/seed0"
+    o, _, _ = trajectories.observe(trajectories.load(*(folder / name for name in trajectories.files("test"))), [0], 0, "cpu")
+    for num in (500, 1000, 2000, 4000):
+        filters = particles.Filters(num)
+        line(f"particle filter of one trajectory, {num} particles", rate(lambda: filters.predict(o), len(o)))
     train(peak())
     subprocess.run([sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", __file__], check=True)
 
