@@ -50,7 +50,8 @@ def in_the_loop(values):
 
 
 def spread(values):
-    return {"mean": float(np.mean(values)), "std": float(np.std(values))}
+    """Mean and sample standard deviation of two values or more."""
+    return {"mean": float(np.mean(values)), "std": float(np.std(values, ddof=1))}
 
 
 def summarise(done):

@@ -74,8 +74,8 @@ def in_the_loop(results):
 
 def calibrated(results):
     """Whether sigma is true, on the test set and in each policy's loop, as it is and scaled on the validation set."""
-    rows = []
-    for name, e in (results["estimator_ablation"] | results.get("in_the_loop", {})).items():
+    rows, filtered = [], {f"filter, {row}": rates["filter"] for row, rates in results.get("filter", {}).items()}
+    for name, e in (results["estimator_ablation"] | results.get("in_the_loop", {}) | filtered).items():
         for key in calibration.TALLIES:
             if told := e.get(key):
                 shares = [", ".join(f"{100 * x:.0f}" for x in told[f"within_{k}_sigma"]) for k in (1, 2)]
@@ -84,7 +84,7 @@ def calibrated(results):
                 scores = [", ".join(f"{x:.2f}" for x in values) for values in (told["nll"], told["crps"], nees)]
                 rows.append([f"{name}{', scaled' * (key == 'scaled')}", *shares, *scores])
     title = "Calibration of x, y (mm) and theta (degrees), of estimators on the test set and in the loops of policies"
-    return titled(title, ["sigma of", "1 (68 %)", "2 (95 %)", "NLL", "CRPS", "NEES / 3: seen, 3 s, 10 s after"], rows)
+    return titled(title, ["sigma of", "1 (68 %)", "2 (95 %)", "NLL", "CRPS", "NEES / 3: seen, 3, 10 s after"], rows)
 
 
 def foreseen(results):
@@ -99,9 +99,9 @@ def filtered(results):
     """The particle filter beside the estimators, on the same trajectories."""
     sets = results.get("filter", {})
     kinds = [*next(iter(sets.values()), {})]
-    rows = [[name, *(", ".join(within(e[key], e["half_95"][key]) for key in MEANS) for e in rates.values())]
-            for name, rates in sets.items()]
-    title = "The particle filter beside the estimators: mean L2 (mm), mean abs. (deg), with 95 % intervals"
+    rows = [[name, *("; ".join([*(within(e[key], e["half_95"][key]) for key in MEANS), f"{e['trans_rmse_mm']:.2f}"])
+                     for e in rates.values())] for name, rates in sets.items()]
+    title = "The particle filter beside the estimators: mean L2 (mm) and abs. (deg) with 95 % intervals; RMSE (mm)"
     return titled(title, ["trajectories", *kinds], rows)
 
 

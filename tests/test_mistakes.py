@@ -112,6 +112,11 @@ def test_too_few_particles_are_one_line(study, call):
     assert is_mistake(*call(study, "05_evaluate", "--particles", "9"), "--particles 9", "say 10 or more")
 
 
+def test_an_ensemble_without_one_of_its_nets_says_which_to_train(study, call):
+    assert is_mistake(*call(study, "04_train_policy", "--method", "est_ensemble"), "03_train_estimator.py", "likelihood", "--seed 1")
+    assert not (study / "smoke/04_train_policy/est_ensemble").exists()
+
+
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_every_preset_is_a_config(script):
     module = importlib.import_module(script)
