@@ -87,6 +87,8 @@ def summarise(done):
             row["seeds"] = spread([np.mean(values) for values in by_seed.values()]) | {"count": len(by_seed)}
     for method, difference in minus_est_uncertainty("success_rate/{}/0").items():
         results["success_rate"][method]["minus_est_uncertainty"] = difference
+    for method, rate in results.get("filter_loop", {}).get("filter", {}).items():
+        rate["minus_ours"] = paired(*(done[f"filter_loop/{name}/{method}"] for name in ("filter", "ours")))
     results["minus_est_uncertainty"] = {"full occlusion": minus_est_uncertainty("occlusion_duration/{}/full")} | {
         world: minus_est_uncertainty(f"other_worlds/{world}/{{}}") for world in results["other_worlds"]}
     return results

@@ -144,8 +144,9 @@ def further(results):
     sections = {f"starts {name}": rates for name, rates in results.get("starts", {}).items()}
     sections |= {f"{name} in the loop": rates for name, rates in results.get("filter_loop", {}).items()}
     sections["actions sampled"] = results.get("sampled_actions", {})
-    return "\n".join(f"- {method}, {what}: success {percent(rate)}" for what, rates in sections.items()
-                     for method, rate in rates.items())
+    return "\n".join(f"- {method}, {what}: success {percent(rate)}" + (
+        f", minus ours, paired {points(rate['minus_ours'], '+')}" if "minus_ours" in rate else "")
+        for what, rates in sections.items() for method, rate in rates.items())
 
 
 SECTIONS = (beside_paper, estimator_ablation, success_rate, in_the_loop, calibrated, foreseen, filtered,

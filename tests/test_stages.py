@@ -166,7 +166,8 @@ def test_results_have_every_number(study):
     for row in results["filter"].values():
         assert row.keys() == ESTIMATORS | {"vision", "filter"} and all(each["trans_mean_l2_mm"] > 0 for each in row.values())
     assert results["filter_loop"].keys() == {"ours", "filter"}
-    for rates in results["filter_loop"].values():
+    for name, rates in results["filter_loop"].items():
+        assert all(("minus_ours" in rate) == (name == "filter") for rate in rates.values())
         assert rates.keys() == {"est_uncertainty", "priv_on_estimate"} and {rate["episodes"] for rate in rates.values()} == {2}
     assert results["contact_switches"].keys() == {"priv_on_state", "est_uncertainty"}
     for row in results["contact_switches"].values():
