@@ -78,16 +78,17 @@ def bootstrap(statistic, count):
 def summary(tallies):
     """Calibration of tallies (N, sum of PARTS): shares within 1 and 2 sigma, NLL and CRPS of x, y (mm), theta (degrees);
     the curve, {level: shares}; of bins of sigma (mm) the root mean square error (mm); and the NEES / 3, 1 if true, at those of
-    AGES that there are, each of so many trajectories.
+    AGES that there are, each a mean over so many trajectories.
     """
     sums = parts(tallies)
     steps, ages = sums["count"].sum(), sums["aged"].any(0).sum()  # who comes to 3 s came to 2 s
-    aged, nees = sums["aged"][:, :ages], sums["nees"][:, :ages] / 3
+    aged = sums["aged"][:, :ages]
+    reached, nees = aged > 0, sums["nees"][:, :ages] / 3 / np.maximum(aged, 1)  # one value a trajectory
     curve = (sums["within"].sum(0) / steps).reshape(-1, 3).tolist()
     count = np.maximum(sums["count"].sum(0), 1)
 
     def mean_nees(weights):
-        told = weights @ aged
+        told = weights @ reached
         return np.divide(weights @ nees, told, out=np.full(ages, np.nan), where=told > 0)
 
     return {"within_1_sigma": curve[2], "within_2_sigma": curve[5]} | {
@@ -95,7 +96,7 @@ def summary(tallies):
         "curve": dict(zip(map("{:.3f}".format, LEVELS), curve)), "steps": sums["count"].sum(0).tolist(),
         **{f"{name}_mm": np.sqrt(sums[of].sum(0) / count).tolist() for name, of in (("sigma", "variances"), ("rmse", "squares"))},
         "nees": {name: x.tolist() for name, x in bootstrap(mean_nees, len(nees)).items()},
-        "nees_count": (aged > 0).sum(0).tolist()}
+        "nees_count": reached.sum(0).tolist()}
 
 
 def course(variance, length, success, horizon):
