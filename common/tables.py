@@ -73,9 +73,11 @@ def in_the_loop(results):
 
 
 def calibrated(results):
-    """Whether sigma is true, on the test set and in each policy's loop, as it is and scaled on the validation set."""
-    rows, filtered = [], {f"filter, {row}": rates["filter"] for row, rates in results.get("filter", {}).items()}
-    for name, e in (results["estimator_ablation"] | results.get("in_the_loop", {}) | filtered).items():
+    """Whether sigma is true, on the test set and in each policy's loop, as it is and scaled on the validation set; and the
+    filter's.
+    """
+    rows, filters = [], {f"filter, {row}": rates["filter"] for row, rates in results.get("filter", {}).items()}
+    for name, e in (results["estimator_ablation"] | results.get("in_the_loop", {}) | filters).items():
         for key in calibration.TALLIES:
             if told := e.get(key):
                 shares = [", ".join(f"{100 * x:.0f}" for x in told[f"within_{k}_sigma"]) for k in (1, 2)]
@@ -83,8 +85,9 @@ def calibrated(results):
                 nees = [mean[age] for age in (0, 3, 10) if age < len(mean)]
                 scores = [", ".join(f"{x:.2f}" for x in values) for values in (told["nll"], told["crps"], nees)]
                 rows.append([f"{name}{', scaled' * (key == 'scaled')}", *shares, *scores])
-    title = "Calibration of x, y (mm) and theta (degrees), of estimators on the test set and in the loops of policies"
-    return titled(title, ["sigma of", "1 (68 %)", "2 (95 %)", "NLL", "CRPS", "NEES / 3: seen, 3, 10 s after"], rows)
+    title = "Calibration of x, y (mm) and theta (degrees), of estimators on the test set, in policies' loops, and of the filter"
+    header = ["sigma of", "1 (68 %)", "2 (95 %)", "NLL", "CRPS", "NEES / 3: seen, 3, 10 s after"]
+    return titled(title, header, rows)
 
 
 def foreseen(results):

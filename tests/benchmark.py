@@ -139,8 +139,9 @@ def main():
             stack = stacks.make(stacks.METHODS["est_uncertainty"], WORLDS, estimator, passes)
             line(f"{name} estimator in the loop, all included, M = {passes}, {WORLDS} worlds", rate(*play(stack, 2)))
     folder = Path(__file__).parent.parent / "pretrained/02_collect/seed0"
-    o, _, _ = trajectories.observe(trajectories.load(*(folder / name for name in trajectories.files("test"))), np.array([0]), 0, "cpu")
-    for num in (500, 1000, 2000, 4000):
+    test = trajectories.load(*(folder / name for name in trajectories.files("test")))
+    o, _, _ = trajectories.observe(test, np.array([len(test[1]) - 2]), 0, "cpu")  # the last, whose player pushes
+    for num in (250, 500, 1000, 2000, 4000):
         filters = particles.Filters(num)
         line(f"particle filter of one trajectory, {num} particles", rate(lambda: filters.predict(o), len(o)))
     train(peak())

@@ -113,7 +113,8 @@ def test_too_few_particles_are_one_line(study, call):
 
 
 def test_an_ensemble_without_one_of_its_nets_says_which_to_train(study, call):
-    assert is_mistake(*call(study, "04_train_policy", "--method", "est_ensemble"), "03_train_estimator.py", "likelihood", "--seed 1")
+    ended = call(study, "04_train_policy", "--method", "est_ensemble")
+    assert is_mistake(*ended, "03_train_estimator.py", "likelihood", "--seed 1")
     assert not (study / "smoke/04_train_policy/est_ensemble").exists()
 
 
