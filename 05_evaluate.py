@@ -96,7 +96,9 @@ def trained(cfg):
 
 
 def estimator_errors(cfg, players, test, name):
-    """Row of tab. estimator_ablation on the test set, or of the filter's table; vision is the pose in o, held when occluded."""
+    """Row of tab. estimator_ablation on the test set, or, for the filter's table, sums of each trajectory, which
+    trajectories.compared makes; vision is the pose in o, held when occluded.
+    """
     section, kind = name.split("/", 1)
     data, limit, size = test, cfg.test, 100
     if section == "filter":
@@ -112,6 +114,8 @@ def estimator_errors(cfg, players, test, name):
     sums = trajectories.measure(data, limit, size, LIST + cfg.seed, players.device, predict, players.world,
                                 getattr(estimator, "scale", None))
     progress.close()
+    if section == "filter":
+        return {part: values.tolist() for part, values in sums.items()}
     return statistics.error_table(sums) if sums else None
 
 
@@ -208,9 +212,10 @@ def main(cfg):
         return [*runs.hashes_of(cfg, paths).values()]
 
     pi_priv, tested = policies["priv_on_state", 0], [kind for kind in estimators if not ESTIMATORS[kind].scaled]
-    sources = {f"estimator_ablation/{kind}": sha(*test_paths.values(), *estimators.get(kind, ())) for kind in ("vision", *tested)}
-    sources |= {f"estimator_seeds/{kind}": sha(*test_paths.values(), *paths) for kind, paths in again.items()}
-    sources |= {f"filter/{row}/{kind}": sha(*test_paths.values(), pi_priv, *estimators.get(kind, ()))
+    sources = {f"estimator_ablation/{kind}": [*test_paths.values(), *estimators.get(kind, ())] for kind in ("vision", *tested)}
+    sources |= {f"estimator_seeds/{kind}": [*test_paths.values(), *paths] for kind, paths in again.items()}
+    sources = {name: sha(*paths) + [calibration.SUMMARY] for name, paths in sources.items()}
+    sources |= {f"filter/{row}/{kind}": sha(*test_paths.values(), pi_priv, *estimators.get(kind, ())) + [calibration.PARTS]
                 for row in ("test", "drifting", *(row for row in FILTERED if row in other_worlds(run.world)))
                 if cfg.filter_trajectories for kind in ("vision", *tested, "filter")}
     sources |= {name: sha(policies[m.method, m.seed], *estimators.get(METHODS[m.method].estimator, ()))

@@ -12,9 +12,11 @@ LEVELS = [math.erf(bound / 2**0.5) for bound in BOUNDS]  # the share of a Gaussi
 EDGES = np.geomspace(1, 32, 6)  # mm, of sigma in x and y together: error against sigma
 AGES = range(11)  # s since the box was last seen
 SOON = 2 * task.RATE  # steps within which a failure is to be foreseen
+SCORES = ("sigma", "rise", "time", "sigma_minus_time")  # what a failure is foreseen by; the gain of sigma
 TALLIES = ("calibration", "scaled")  # of the predicted sigma, and of it times the scale that the validation set gave
 PARTS = {"ratios": 4, "within": 3 * len(LEVELS), "nll": 3, "crps": 3, "count": len(EDGES) + 1,
          "squares": len(EDGES) + 1, "variances": len(EDGES) + 1, "aged": len(AGES), "nees": len(AGES)}  # of a tally: widths
+SUMMARY = 2  # one more whenever `summary` tells something else: 05 then measures anew what it stores as such
 
 
 def pose_error(q_hat, q):
@@ -76,24 +78,25 @@ def bootstrap(statistic, count):
 
 
 def summary(tallies):
-    """Calibration of tallies (N, sum of PARTS): shares within 1 and 2 sigma, NLL and CRPS of x, y (mm), theta (degrees);
-    the curve, {level: shares}; of bins of sigma (mm) the root mean square error (mm); and the NEES / 3, 1 if true, at those of
-    AGES that there are, each a mean over so many trajectories.
+    """Calibration of tallies (N, sum of PARTS): shares within 1 and 2 sigma, with intervals, NLL and CRPS of x, y (mm), theta
+    (degrees); the curve, {level: shares}; of bins of sigma (mm) the root mean square error (mm); and the NEES / 3, 1 if true,
+    at those of AGES that there are, each a mean over so many trajectories.
     """
     sums = parts(tallies)
     steps, ages = sums["count"].sum(), sums["aged"].any(0).sum()  # who comes to 3 s came to 2 s
     aged = sums["aged"][:, :ages]
     reached, nees = aged > 0, sums["nees"][:, :ages] / 3 / np.maximum(aged, 1)  # one value a trajectory
-    curve = (sums["within"].sum(0) / steps).reshape(-1, 3).tolist()
+    within = bootstrap(lambda weights: weights @ sums["within"] / (weights @ sums["count"].sum(1)), len(nees))
+    within = {name: x.reshape(-1, 3).tolist() for name, x in within.items()}
     count = np.maximum(sums["count"].sum(0), 1)
 
     def mean_nees(weights):
         told = weights @ reached
         return np.divide(weights @ nees, told, out=np.full(ages, np.nan), where=told > 0)
 
-    return {"within_1_sigma": curve[2], "within_2_sigma": curve[5]} | {
+    return {f"within_{k}_sigma": {name: x[of] for name, x in within.items()} for k, of in ((1, 2), (2, 5))} | {
         name: (sums[name].sum(0) / steps).tolist() for name in ("nll", "crps")} | {
-        "curve": dict(zip(map("{:.3f}".format, LEVELS), curve)), "steps": sums["count"].sum(0).tolist(),
+        "curve": dict(zip(map("{:.3f}".format, LEVELS), within["mean"])), "steps": sums["count"].sum(0).tolist(),
         **{f"{name}_mm": np.sqrt(sums[of].sum(0) / count).tolist() for name, of in (("sigma", "variances"), ("rmse", "squares"))},
         "nees": {name: x.tolist() for name, x in bootstrap(mean_nees, len(nees)).items()},
         "nees_count": reached.sum(0).tolist()}
@@ -120,19 +123,25 @@ def area(score, label, weight):
 
 
 def foreseen(courses):
-    """How well sigma tells, each second of an episode, whether it leaves the workspace within 2 s, from `course`'s rows: areas
-    under ROC curves of sigma, its rise in the last second, and elapsed time alone, with intervals over episodes. Time-outs
-    left out; none if there is nothing to tell apart.
+    """How well sigma tells, each second of an episode from the second on (an estimator's first sigma is no course), whether it
+    leaves the workspace within 2 s, from `course`'s rows: areas under ROC curves of sigma, its rise in the last second, and
+    elapsed time alone, and sigma's minus time's, with intervals over episodes. Time-outs left out; none if there is nothing to
+    tell apart.
     """
     courses = np.asarray(courses, float)
     courses = courses[np.isfinite(courses[:, 1])]
     (length, left), sigma = courses[:, :2].T, courses[:, 2:]
     seconds = np.arange(sigma.shape[1])
-    episode, second = np.nonzero((task.RATE * seconds < length[:, None]) & (seconds > 0))
+    episode, second = np.nonzero((task.RATE * seconds < length[:, None]) & (seconds > 1))
     now = sigma[episode, second]
     label = left[episode] * (length[episode] - task.RATE * second <= SOON)
     if not 0 < label.sum() < len(label):
         return None
-    scores = {"sigma": now, "rise": now - sigma[episode, second - 1], "time": second}
-    return {name: bootstrap(lambda w: area(score, label, w[episode]), len(length)) for name, score in scores.items()} | {
+
+    def areas(weights):
+        by = [area(score, label, weights[episode]) for score in (now, now - sigma[episode, second - 1], second)]
+        return np.array([*by, by[0] - by[2]])
+
+    told = bootstrap(areas, len(length))
+    return {score: {name: float(x[i]) for name, x in told.items()} for i, score in enumerate(SCORES)} | {
         "episodes": len(length), "left": int(left.sum())}

@@ -188,12 +188,16 @@ def other_worlds(results, path):
 
 
 def calibration(results, path):
-    """Is sigma true? On the test set, and in the loop of est_uncertainty: coverage of central intervals, error against sigma,
-    NEES after the last sight.
+    """Is sigma true? On the test set, the filter's on some of it, and in the loop of est_uncertainty, as it is and scaled:
+    coverage of central intervals, error against sigma, NEES after the last sight.
     """
     summaries = {style(kind)[:2]: e["calibration"] for kind, e in results["estimator_ablation"].items() if "calibration" in e}
     if loop := results.get("in_the_loop", {}).get("est_uncertainty"):
-        summaries[f"{METHODS['est_uncertainty'].estimator}, in the loop", "0.3"] = loop["calibration"]
+        label = f"{METHODS['est_uncertainty'].estimator}, in the loop"
+        summaries |= {(label + end, color): loop[key] for key, end, color in
+                      (("calibration", "", "0.3"), ("scaled", ", scaled", "0.6")) if key in loop}
+    if filtered := results.get("filter", {}).get("test"):
+        summaries["particle filter", "#882255"] = filtered["filter"]["calibration"]
     figure, (curve, errors, nees) = new(11, 3.7, 1, 3)
     for (label, color), c in summaries.items():
         levels = [0, *map(float, c["curve"]), 1]

@@ -18,10 +18,14 @@ def wilson(values):
     return {"mean": p, "low": min(p, max(0.0, low)), "high": max(p, min(1.0, high)), "episodes": n}  # rounding: p = 0, 1
 
 
-def paired(values, reference):
-    """Mean difference over the same episodes with its 95 % interval."""
+def paired(values, reference, steps=None):
+    """Mean difference over the same episodes, or over all their steps where the values are sums over so many, with its 95 %
+    interval.
+    """
     d = np.subtract(values, reference, dtype=float)
-    mean, half = float(d.mean()), Z * float(d.std()) / math.sqrt(len(d))
+    steps = np.ones(len(d)) if steps is None else np.asarray(steps)
+    mean = float(d.sum() / steps.sum())
+    half = Z * float(np.linalg.norm(d - mean * steps) / steps.sum())
     return {"mean": mean, "low": mean - half, "high": mean + half}
 
 
@@ -37,7 +41,10 @@ def errors(sums):
 
 
 def error_table(sums):
-    """`errors` over all steps and, below "seen" and "occluded", over those that there are; and whether sigma is true."""
+    """Of {name: sums of each trajectory} `errors` over all steps and, below "seen" and "occluded", over those that there are;
+    and whether sigma is true.
+    """
+    sums = {name: np.asarray(values) for name, values in sums.items()}
     return errors(sums["all"]) | {name: errors(sums[name]) for name in ("seen", "occluded") if sums[name][0].any()} | {
         name: calibration.summary(sums[name].T) for name in calibration.TALLIES if name in sums}
 
@@ -55,11 +62,11 @@ def spread(values):
 
 
 def summarise(done):
-    """results.json from {section/key/...: a number or trajectories.in_the_loop of each episode, or an error table}, as 05
-    measures them.
+    """results.json from {section/key/...: a number or trajectories.in_the_loop of each episode, sums of each trajectory, or an
+    error table}, as 05 measures them.
     """
     results = {"occlusion_duration": {}, "other_worlds": {}}
-    kinds = {"estimator_ablation": dict, "estimator_seeds": dict, "filter": dict, "success_rate": list,
+    kinds = {"estimator_ablation": dict, "estimator_seeds": dict, "filter": error_table, "success_rate": list,
              "in_the_loop": in_the_loop, "contact_switches": lambda v: spread(v) | {"episodes": len(v)}}
     for name, values in done.items():
         *keys, last = name.split("/")
@@ -87,6 +94,10 @@ def summarise(done):
             row["seeds"] = spread([np.mean(values) for values in by_seed.values()]) | {"count": len(by_seed)}
     for method, difference in minus_est_uncertainty("success_rate/{}/0").items():
         results["success_rate"][method]["minus_est_uncertainty"] = difference
+    for row, by in results.get("filter", {}).items():
+        if "ensemble" in by:
+            (steps, l2, *_), (_, other, *_) = (done[f"filter/{row}/{kind}"]["all"] for kind in ("filter", "ensemble"))
+            by["filter"]["minus_ensemble_mm"] = paired(1e3 * np.array(l2), 1e3 * np.array(other), steps)
     for method, rate in results.get("filter_loop", {}).get("filter", {}).items():
         rate["minus_ours"] = paired(*(done[f"filter_loop/{name}/{method}"] for name in ("filter", "ours")))
     results["minus_est_uncertainty"] = {"full occlusion": minus_est_uncertainty("occlusion_duration/{}/full")} | {

@@ -80,32 +80,38 @@ def calibrated(results):
     for name, e in (results["estimator_ablation"] | results.get("in_the_loop", {}) | filters).items():
         for key in calibration.TALLIES:
             if told := e.get(key):
-                shares = [", ".join(f"{100 * x:.0f}" for x in told[f"within_{k}_sigma"]) for k in (1, 2)]
+                shares = []
+                for share in (told["within_1_sigma"], told["within_2_sigma"]):
+                    half = max(high - low for low, high in zip(share["low"], share["high"])) / 2
+                    shares.append(f"{', '.join(f'{100 * x:.0f}' for x in share['mean'])} +- {100 * half:.1f}")
                 mean = told["nees"]["mean"]
                 nees = [mean[age] for age in (0, 3, 10) if age < len(mean)]
                 scores = [", ".join(f"{x:.2f}" for x in values) for values in (told["nll"], told["crps"], nees)]
                 rows.append([f"{name}{', scaled' * (key == 'scaled')}", *shares, *scores])
-    title = "Calibration of x, y (mm) and theta (degrees), of estimators on the test set, in policies' loops, and of the filter"
-    header = ["sigma of", "1 (68 %)", "2 (95 %)", "NLL", "CRPS", "NEES / 3: seen, 3, 10 s after"]
+    title = "Calibration of x, y (mm), theta (deg); shares with the widest of 95 % intervals, NEES by time since the last sight"
+    header = ["sigma of", "1 (68 %)", "2 (95 %)", "NLL", "CRPS", "NEES / 3: 0, 3, 10 s"]
     return titled(title, header, rows)
 
 
 def foreseen(results):
     """Whether sigma tells that an episode leaves the workspace."""
-    rows = [[method, str(told["left"]), *(points(told[score]) for score in ("sigma", "rise", "time"))]
+    rows = [[method, str(told["left"]), *(points(told[score]) for score in calibration.SCORES)]
             for method, e in results.get("in_the_loop", {}).items() if (told := e.get("foreseen"))]
-    header = ["policy", "left", "by sigma", "by its rise in 1 s", "by elapsed time"]
+    header = ["policy", "left", "by sigma", "by its rise in 1 s", "by elapsed time", "sigma minus time"]
     return titled("Leaving the workspace within 2 s, foreseen: area under the ROC curve in %, with 95 % intervals", header, rows)
 
 
 def filtered(results):
     """The particle filter beside the estimators, on the same trajectories."""
-    sets = results.get("filter", {})
+    sets, rows = results.get("filter", {}), []
     kinds = [*next(iter(sets.values()), {})]
-    rows = [[name, *("; ".join([*(within(e[key], e["half_95"][key]) for key in MEANS), f"{e['trans_rmse_mm']:.2f}"])
-                     for e in rates.values())] for name, rates in sets.items()]
-    title = "The particle filter beside the estimators: mean L2 (mm) and abs. (deg) with 95 % intervals; RMSE (mm)"
-    return titled(title, ["trajectories", *kinds], rows)
+    for name, rates in sets.items():
+        cells = ["; ".join([*(within(e[key], e["half_95"][key]) for key in MEANS), f"{e['trans_rmse_mm']:.2f}"])
+                 for e in rates.values()]
+        d = rates["filter"].get("minus_ensemble_mm")
+        rows.append([name, *cells, "{mean:+.2f} [{low:+.2f}, {high:+.2f}]".format(**d) if d else ""])
+    title = "The particle filter beside the estimators: mean L2 (mm) and abs. (deg) with 95 % intervals; RMSE (mm); paired, of L2"
+    return titled(title, ["trajectories", *kinds, "minus ensemble"], rows)
 
 
 def success_rate(results):

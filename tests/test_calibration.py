@@ -34,8 +34,11 @@ def told(factor=1.0, occluded=None, mask=None, seed=0):
 
 def test_a_true_sigma_is_called_true():
     summary = calibration.summary(told())
-    assert summary["within_1_sigma"] == pytest.approx([0.683] * 3, abs=0.01)
-    assert summary["within_2_sigma"] == pytest.approx([0.954] * 3, abs=0.005)
+    assert summary["within_1_sigma"]["mean"] == pytest.approx([0.683] * 3, abs=0.01)
+    low, high = (np.array(summary["within_1_sigma"][name]) for name in ("low", "high"))
+    half = 1.96 * math.sqrt(0.683 * 0.317 / (T * B))  # here, unlike in an estimator's errors, all steps are independent
+    assert (high - low) / 2 == pytest.approx([half] * 3, rel=0.25)
+    assert summary["within_2_sigma"]["mean"] == pytest.approx([0.954] * 3, abs=0.005)
     for level, shares in summary["curve"].items():
         assert shares == pytest.approx([float(level)] * 3, abs=0.01)
     q_hat, variance, q = drawn()
@@ -51,11 +54,11 @@ def test_a_true_sigma_is_called_true():
 def test_the_scale_makes_a_wrong_sigma_true(factor):
     scale = calibration.scale(told(factor))
     assert scale == pytest.approx([factor] * 4, rel=0.02)
-    wrong = calibration.summary(told(factor))["within_1_sigma"]
+    wrong = calibration.summary(told(factor))["within_1_sigma"]["mean"]
     assert wrong == pytest.approx([math.erf(1 / factor / 2**0.5)] * 3, abs=0.02)
     q_hat, variance, q = drawn(factor)
     right = calibration.tally(q_hat, variance * np.square(scale), q, np.zeros((T, B)), np.ones((T, B)))
-    assert calibration.summary(right)["within_1_sigma"] == pytest.approx([0.683] * 3, abs=0.01)
+    assert calibration.summary(right)["within_1_sigma"]["mean"] == pytest.approx([0.683] * 3, abs=0.01)
 
 
 @pytest.mark.parametrize("spread", [0.03, 0.3])
@@ -106,6 +109,11 @@ def test_a_sigma_that_rises_before_the_end_foresees_it():
     assert seen["episodes"] == 300 and seen["left"] == (~success).sum()
     assert seen["sigma"]["mean"] > 0.95 and seen["sigma"]["low"] <= seen["sigma"]["mean"] <= seen["sigma"]["high"]
     assert seen["rise"]["mean"] > 0.65 and seen["time"]["mean"] < 0.75
+    gain = seen["sigma_minus_time"]
+    assert gain["mean"] == pytest.approx(seen["sigma"]["mean"] - seen["time"]["mean"]) and gain["low"] > 0
+    variance[0] = 1e4  # an estimator's first sigma, before it has seen anything move
+    first = calibration.foreseen(calibration.course(variance, length, success, 300))
+    assert first["rise"] == seen["rise"]
     timed_out = calibration.course(variance, np.full(300, 300), np.zeros(300, bool), 300)
     assert calibration.foreseen(timed_out) is None
 

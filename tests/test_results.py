@@ -37,6 +37,17 @@ def test_paired_difference_is_narrower_than_the_independent_one():
     assert statistics.paired(a, a) == {"mean": 0, "low": 0, "high": 0}
 
 
+def test_paired_sums_over_steps_weigh_the_steps_alike():
+    rng = np.random.default_rng(0)
+    steps, held = rng.integers(50, 300, (300, 100)), 0
+    for lengths in steps:
+        off = rng.normal(0.5, 2, 100) * lengths  # a trajectory errs alike at each of its steps
+        d = statistics.paired(7 + off, 7, lengths)
+        assert d["mean"] == pytest.approx(off.sum() / lengths.sum())
+        held += d["low"] <= 0.5 <= d["high"]
+    assert held / 300 == pytest.approx(0.95, abs=0.04)
+
+
 def made_up(seeds=1, methods=stacks.METHODS):
     """Values of every measurement, as 05 stores them."""
     rng = np.random.default_rng(0)
@@ -57,8 +68,9 @@ def made_up(seeds=1, methods=stacks.METHODS):
             errors = {part: [9, *rng.uniform(0, 1, 4)] for part in ("all", "seen", "occluded")}
             done[name] = [errors | {"calibration": tallies[i % 9].tolist(), "course": courses[i].tolist()}
                           for i in range(m.episodes)]
-    return done | {f"filter/{row}/{kind}": done["estimator_ablation/ours"] for row in ("test", "c=0.078")
-                   for kind in ("ours", "filter")}
+    sums = rng.uniform(0.9, 1.1, (5, 9)) * [[200], [0.8], [0.004], [4], [0.1]]
+    sums = dict.fromkeys(("all", "seen", "occluded"), sums.tolist()) | {"calibration": tallies.T.tolist()}
+    return done | {f"filter/{row}/{kind}": sums for row in ("test", "c=0.078") for kind in ("ensemble", "filter")}
 
 
 def test_results_have_the_published_layout():
