@@ -12,11 +12,12 @@ LEVELS = [math.erf(bound / 2**0.5) for bound in BOUNDS]  # the share of a Gaussi
 EDGES = np.geomspace(1, 32, 6)  # mm, of sigma in x and y together: error against sigma
 AGES = range(11)  # s since the box was last seen
 SOON = 2 * task.RATE  # steps within which a failure is to be foreseen
-SCORES = ("sigma", "rise", "time", "sigma_minus_time")  # what a failure is foreseen by; the gain of sigma
+SCORES = ("sigma", "rise", "time", "sigma_minus_time")  # what foresees a failure; last, sigma's area minus time's
 TALLIES = ("calibration", "scaled")  # of the predicted sigma, and of it times the scale that the validation set gave
+# Of a tally, with their widths; a part that comes to mean another thing takes another name, and 05 measures it anew
 PARTS = {"ratios": 4, "within": 3 * len(LEVELS), "nll": 3, "crps": 3, "count": len(EDGES) + 1,
-         "squares": len(EDGES) + 1, "variances": len(EDGES) + 1, "aged": len(AGES), "nees": len(AGES)}  # of a tally: widths
-SUMMARY = 2  # one more whenever `summary` tells something else: 05 then measures anew what it stores as such
+         "squares": len(EDGES) + 1, "variances": len(EDGES) + 1, "aged": len(AGES), "nees": len(AGES)}
+SUMMARY = 2  # one more whenever error_table or `summary` tell something else: 05 measures anew what it stores as such
 
 
 def pose_error(q_hat, q):
@@ -123,8 +124,8 @@ def area(score, label, weight):
 
 
 def foreseen(courses):
-    """How well sigma tells, each second of an episode from the second on (an estimator's first sigma is no course), whether it
-    leaves the workspace within 2 s, from `course`'s rows: areas under ROC curves of sigma, its rise in the last second, and
+    """How well sigma tells, each second of an episode from 2 s on (the first sigma enters the rise at 1 s), whether it leaves
+    the workspace within 2 s, from `course`'s rows: areas under ROC curves of sigma, its rise in the last second, and
     elapsed time alone, and sigma's minus time's, with intervals over episodes. Time-outs left out; none if there is nothing to
     tell apart.
     """

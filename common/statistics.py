@@ -18,23 +18,28 @@ def wilson(values):
     return {"mean": p, "low": min(p, max(0.0, low)), "high": max(p, min(1.0, high)), "episodes": n}  # rounding: p = 0, 1
 
 
+def ratio(sums, steps):
+    """Mean (...) over all steps, and half its 95 % interval, of sums (..., N) over `steps` (N,) steps of each trajectory: only
+    trajectories are independent.
+    """
+    total = steps.sum()
+    mean = sums.sum(-1) / total
+    return mean, Z * np.linalg.norm(sums - mean[..., None] * steps, axis=-1) / total
+
+
 def paired(values, reference, steps=None):
-    """Mean difference over the same episodes, or over all their steps where the values are sums over so many, with its 95 %
-    interval.
+    """Mean difference over the same episodes, or, of values that are sums over `steps` steps each, over all steps, with its
+    95 % interval.
     """
     d = np.subtract(values, reference, dtype=float)
-    steps = np.ones(len(d)) if steps is None else np.asarray(steps)
-    mean = float(d.sum() / steps.sum())
-    half = Z * float(np.linalg.norm(d - mean * steps) / steps.sum())
+    mean, half = map(float, ratio(d, np.ones(len(d)) if steps is None else np.asarray(steps)))
     return {"mean": mean, "low": mean - half, "high": mean + half}
 
 
 def errors(sums):
     """Row of tab. estimator_ablation from sums (5, N) of trajectories.pose_errors: ERRORS in mm and degrees, and half_95."""
     unit = np.array([1e3, 1e3 / math.sqrt(2), np.rad2deg(1), np.rad2deg(1)])  # the paper's RMSE in mm is per axis
-    steps = sums[0].sum()
-    mean = sums[1:].sum(1) / steps
-    half = Z * np.linalg.norm(sums[1:] - mean[:, None] * sums[0], axis=1) / steps  # only trajectories are independent
+    mean, half = ratio(sums[1:], sums[0])
     mean[[1, 3]] **= 0.5
     half[[1, 3]] /= np.maximum(2 * mean[[1, 3]], 1e-12)
     return dict(zip(ERRORS, (unit * mean).tolist())) | {"half_95": dict(zip(ERRORS, (unit * half).tolist()))}

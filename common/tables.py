@@ -33,6 +33,15 @@ def within(mean, half):
     return f"{mean:.2f} [{mean - half:.2f}, {mean + half:.2f}]"
 
 
+def coverage(told):
+    """Shares of x, y and theta within one and two sigma, in percent, +- half the widest of the three intervals."""
+    cells = []
+    for share in (told["within_1_sigma"], told["within_2_sigma"]):
+        half = max(high - low for low, high in zip(share["low"], share["high"])) / 2
+        cells.append(f"{', '.join(f'{100 * x:.0f}' for x in share['mean'])} +- {100 * half:.1f}")
+    return cells
+
+
 def beside_paper(results):
     """Every number of sec. 5 beside the paper's, with 95 % intervals."""
     rows, units = [], ("mean L2, mm", "RMSE, mm", "mean abs., deg", "RMSE, deg")
@@ -80,15 +89,11 @@ def calibrated(results):
     for name, e in (results["estimator_ablation"] | results.get("in_the_loop", {}) | filters).items():
         for key in calibration.TALLIES:
             if told := e.get(key):
-                shares = []
-                for share in (told["within_1_sigma"], told["within_2_sigma"]):
-                    half = max(high - low for low, high in zip(share["low"], share["high"])) / 2
-                    shares.append(f"{', '.join(f'{100 * x:.0f}' for x in share['mean'])} +- {100 * half:.1f}")
                 mean = told["nees"]["mean"]
                 nees = [mean[age] for age in (0, 3, 10) if age < len(mean)]
                 scores = [", ".join(f"{x:.2f}" for x in values) for values in (told["nll"], told["crps"], nees)]
-                rows.append([f"{name}{', scaled' * (key == 'scaled')}", *shares, *scores])
-    title = "Calibration of x, y (mm), theta (deg); shares with the widest of 95 % intervals, NEES by time since the last sight"
+                rows.append([f"{name}{', scaled' * (key == 'scaled')}", *coverage(told), *scores])
+    title = "Calibration of x, y (mm), theta (deg); shares +- half the widest 95 % interval, NEES by time since the last sight"
     header = ["sigma of", "1 (68 %)", "2 (95 %)", "NLL", "CRPS", "NEES / 3: 0, 3, 10 s"]
     return titled(title, header, rows)
 

@@ -170,3 +170,11 @@ def test_without_mujoco_the_second_simulator_says_what_to_install():
     code = f"import runpy, sys; sys.modules['mujoco'] = None; runpy.run_path({str(script)!r}, run_name='__main__')"
     end = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert end.returncode and end.stderr == "error: no MuJoCo here: pip install mujoco\n"
+
+
+def test_other_players_episodes_are_judged_by_the_published_nets():
+    script = Path(__file__).parent / "who_pushes.py"
+    end = subprocess.run([sys.executable, script, "pretrained", "--episodes", "4", "--passes", "2"], capture_output=True, text=True)
+    lines = [line for line in end.stdout.splitlines() if line.startswith("| ")]
+    assert end.returncode == 0 and len(lines) == 10 and len({len(line) for line in lines}) == 1
+    assert [line.count("+-") for line in lines[1:]] == [4, 4, 4, 4, 4, 2, 4, 4, 2]

@@ -70,7 +70,9 @@ def made_up(seeds=1, methods=stacks.METHODS):
                           for i in range(m.episodes)]
     sums = rng.uniform(0.9, 1.1, (5, 9)) * [[200], [0.8], [0.004], [4], [0.1]]
     sums = dict.fromkeys(("all", "seen", "occluded"), sums.tolist()) | {"calibration": tallies.T.tolist()}
-    return done | {f"filter/{row}/{kind}": sums for row in ("test", "c=0.078") for kind in ("ensemble", "filter")}
+    worse = sums | {"all": (np.array(sums["all"]) * [[1], [1.25], [1.6], [1.25], [1.6]]).tolist()}
+    return done | {f"filter/{row}/{kind}": of for row in ("test", "c=0.078")
+                   for kind, of in (("ensemble", worse), ("filter", sums))}
 
 
 def test_results_have_the_published_layout():
@@ -87,6 +89,9 @@ def test_results_have_the_published_layout():
     assert results["occlusion_loss"]["est"]["mean"] == pytest.approx(lost)
     assert set(results["contact_switches"]["priv_on_state"]) == {"mean", "std", "episodes"}
     assert set(results["starts"]) == {"centre", "inner"}
+    d, rows = results["filter"]["test"]["filter"]["minus_ensemble_mm"], results["filter"]["test"]
+    assert d["mean"] == pytest.approx(rows["filter"]["trans_mean_l2_mm"] - rows["ensemble"]["trans_mean_l2_mm"])
+    assert d["low"] < d["mean"] < d["high"] < 0
     assert all(set(row) == {"priv_on_state", "est_uncertainty"} for row in results["starts"].values())
 
 
