@@ -21,7 +21,7 @@ import numpy as np
 from common import calibration, command, film, particles, plots, ranks, runs, stacks, statistics, tables, task, trajectories
 from common.files import UserError, load_json, save_json, write_atomic
 from common.measurements import FILTERED, Measurement, measurements, other_worlds
-from common.players import LIST, Players
+from common.players import LIST, Players, first_seed
 from common.progress import bar
 from common.stacks import ESTIMATORS, METHODS, TRAINED
 
@@ -45,7 +45,7 @@ PRESETS = {
     "pretrained": dict(episodes=200, sweep_episodes=200, switch_episodes=200, other_episodes=None, passes=10, num_envs=200,
                        filter_trajectories=None, weights=Path(__file__).parent / "pretrained"),
     "smoke": dict(episodes=16, sweep_episodes=8, switch_episodes=16, other_episodes=None, passes=2, test=12,
-                  num_envs=16, filter_trajectories=1, particles=10),
+                  num_envs=16, filter_trajectories=2, particles=10),
     "quick": dict(episodes=900, sweep_episodes=300, switch_episodes=900, other_episodes=300, passes=10, test=2000, num_envs=300,
                   filter_trajectories=20, particles=300),
     "laptop": dict(switch_episodes=2000, passes=10),
@@ -198,8 +198,10 @@ def draw(run, players, results, done):
 def main(cfg):
     if cfg.filter_trajectories and cfg.particles < particles.LEAST:
         raise UserError(f"--particles {cfg.particles}: say {particles.LEAST} or more")
-    if cfg.seed >= 2**22:
-        raise UserError(f"--seed {cfg.seed}: say less than {2**22}")
+    for name in ("switch_episodes", "filter_trajectories"):
+        if getattr(cfg, name) == 1:
+            raise UserError(f"--{name.replace('_', '-')} 1: one tells no interval, say 2 or more")
+    first_seed(cfg)
     device = command.device_of(cfg)
     estimators, again, policies, left_out = trained(cfg)
     test, test_paths = trajectories.load_set(cfg, "test")

@@ -63,7 +63,8 @@ class Reader(Stage):
 
 def parse(config_class: type, presets: dict[str, dict], doc: str, args: list[str]):
     """The config of `[preset] [--field value ...]`; no preset means quick."""
-    script, names = f"python {Path(sys.argv[0]).name}", "|".join(presets)
+    path, names = Path(sys.argv[0]), "|".join(presets)
+    script = f"python {'tests/' * (path.parent.name == 'tests')}{path.name}"
     preset, *args = args if args and not args[0].startswith("-") else ["quick", *args]
     if preset not in presets:
         raise UserError(f"unknown preset {preset!r}: say one of {names}, or --help")

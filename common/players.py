@@ -5,10 +5,18 @@ import numpy as np
 import torch
 
 from common import collection, episodes, film, geometry, measurements, networks, particles, stacks, trajectories, weights
+from common.files import UserError
 from common.stacks import METHODS
 from common.task import World
 
 LIST = 2**40  # first seed of the fixed list: no training draws one as large
+
+
+def first_seed(cfg):
+    """Of the list of cfg.seed. Raises UserError: torch has no seed as large."""
+    if cfg.seed >= 2**22:
+        raise UserError(f"--seed {cfg.seed}: say less than {2**22}")
+    return LIST * (1 + cfg.seed)
 
 
 class Players:
@@ -27,7 +35,7 @@ class Players:
 
     def chunk(self, m, number):
         """Success (N,), length (N,) and film.Recorded of a chunk: starts, dynamics, noise, occlusions as for all policies."""
-        seed = LIST * (1 + self.cfg.seed) + number
+        seed = first_seed(self.cfg) + number
         torch.manual_seed(seed)
         method = METHODS[m.method]
         estimator = self.estimator("filter" if m.filtered else method.estimator)
@@ -49,8 +57,8 @@ class Players:
     def trajectories(self, row):
         """Trajectories of pi_priv on drifting poses, in one of `other_worlds` or, as "drifting", in the nets'."""
         world = self.world if row == "drifting" else measurements.other_worlds(self.world)[row]
-        count, seed = self.cfg.filter_trajectories, LIST * (1 + self.cfg.seed)
-        states, length, _ = collection.collect(self.policy("priv_on_state", 0), world, count, seed, count)
+        count = self.cfg.filter_trajectories
+        states, length, _ = collection.collect(self.policy("priv_on_state", 0), world, count, first_seed(self.cfg), count)
         return states, np.concatenate([[0], length]).cumsum()
 
     def episode(self, m, index):

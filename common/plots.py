@@ -206,7 +206,7 @@ def calibration(results, path):
         errors.plot(np.array(c["sigma_mm"])[enough], np.array(c["rmse_mm"])[enough], "o-", ms=4, color=color)
         told = [i for i, count in enumerate(c["nees_count"]) if count >= 10]
         mean, low, high = (np.array(c["nees"][name])[told] for name in ("mean", "low", "high"))
-        nees.plot(told, mean, color=color)
+        nees.plot(told, mean, "o-", ms=3, color=color)
         nees.fill_between(told, low, high, color=color, alpha=0.2, lw=0)
     for ax in (curve, errors):
         ax.axline((0, 0), slope=1, color="0.5", lw=1, ls=":")
