@@ -109,13 +109,14 @@ def foreseen(results):
 def filtered(results):
     """The particle filter beside the estimators, on the same trajectories."""
     sets, rows = results.get("filter", {}), []
-    against = any("minus_ensemble_mm" in rates["filter"] for rates in sets.values())
+    against = any("ensemble" in rates for rates in sets.values())
     kinds = [*next(iter(sets.values()), {})]
     for name, rates in sets.items():
         cells = ["; ".join([*(within(e[key], e["half_95"][key]) for key in MEANS), f"{e['trans_rmse_mm']:.2f}"])
                  for e in rates.values()]
-        d = rates["filter"].get("minus_ensemble_mm")
-        rows.append([name, *cells, *["{mean:+.2f} [{low:+.2f}, {high:+.2f}]".format(**d)] * bool(d)])
+        if against:
+            cells.append("{mean:+.2f} [{low:+.2f}, {high:+.2f}]".format(**rates["filter"]["minus_ensemble_mm"]))
+        rows.append([name, *cells])
     title = "The particle filter beside the estimators: mean L2 (mm) and abs. (deg) with 95 % intervals; RMSE (mm)"
     return titled(title, ["trajectories", *kinds, *["L2, minus ensemble"] * against], rows)
 

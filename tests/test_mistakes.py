@@ -112,6 +112,11 @@ def test_too_few_particles_are_one_line(study, call):
     assert is_mistake(*call(study, "05_evaluate", "--particles", "9"), "--particles 9", "say 10 or more")
 
 
+@pytest.mark.parametrize("name", ["--filter-trajectories", "--switch-episodes"])
+def test_one_episode_tells_no_interval(study, call, name):
+    assert is_mistake(*call(study, "05_evaluate", name, "1"), f"{name} 1", "say 2 or more")
+
+
 def test_an_ensemble_without_one_of_its_nets_says_which_to_train(study, call):
     ended = call(study, "04_train_policy", "--method", "est_ensemble")
     assert is_mistake(*ended, "03_train_estimator.py", "likelihood", "--seed 1")

@@ -127,6 +127,8 @@ def test_tables_line_up_and_hold_every_method():
         assert len({len(line) for line in lines}) == 1 and len(lines[0]) <= 130
         assert len({line.count("|") for line in lines}) == 1
     assert all(f"| {m} " in tables.success_rate(results) for m in published)
+    alone = {"filter": {"test": {"filter": results["filter"]["test"]["filter"]}}}
+    assert "minus" in tables.filtered(results) and "minus" not in tables.filtered(alone)
     assert "10.0%, 10.0%" in tables.estimator_ablation(results) and "(2)" in tables.success_rate(results)
     beside = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tables.beside_paper(results).splitlines()[4:]]
     assert len(beside) == 16 + 6 + 4 + 2 and ["error of ours: mean L2, mm", "4.00 [0.00, 8.00]", "4.42"] in beside

@@ -168,7 +168,7 @@ def test_results_have_every_number(study):
     assert results["filter_loop"].keys() == {"ours", "filter"}
     for name, rates in results["filter_loop"].items():
         assert all(("minus_ours" in rate) == (name == "filter") for rate in rates.values())
-        assert rates.keys() == {"est_uncertainty", "priv_on_estimate"} and {rate["episodes"] for rate in rates.values()} == {2}
+        assert rates.keys() == {"est_uncertainty", "priv_on_estimate"} and {rate["episodes"] for rate in rates.values()} == {4}
     assert results["contact_switches"].keys() == {"priv_on_state", "est_uncertainty"}
     for row in results["contact_switches"].values():
         assert row["mean"] >= 0 and row["std"] >= 0 and row["episodes"] == 16
