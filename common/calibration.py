@@ -125,9 +125,9 @@ def area(score, label, weight):
 
 def foreseen(courses):
     """How well sigma tells, each second of an episode from 2 s on (the first sigma enters the rise at 1 s), whether it leaves
-    the workspace within 2 s, from `course`'s rows: areas under ROC curves of sigma, its rise in the last second, and
-    elapsed time alone, and sigma's minus time's, with intervals over episodes. Time-outs left out; none if there is nothing to
-    tell apart.
+    the workspace within 2 s, from `course`'s rows: areas under ROC curves of sigma, its rise in the last second and elapsed
+    time alone, and sigma's minus time's, with intervals over episodes. Time-outs left out; none if there is nothing to tell
+    apart.
     """
     courses = np.asarray(courses, float)
     courses = courses[np.isfinite(courses[:, 1])]
@@ -138,9 +138,10 @@ def foreseen(courses):
     label = left[episode] * (length[episode] - task.RATE * second <= SOON)
     if not 0 < label.sum() < len(label):
         return None
+    scores = now, now - sigma[episode, second - 1], second
 
     def areas(weights):
-        by = [area(score, label, weights[episode]) for score in (now, now - sigma[episode, second - 1], second)]
+        by = [area(score, label, weights[episode]) for score in scores]
         return np.array([*by, by[0] - by[2]])
 
     told = bootstrap(areas, len(length))

@@ -21,7 +21,7 @@ from common.measurements import Measurement
 from common.players import Players, first_seed
 
 KINDS = ("ours", "likelihood")
-POLICIES = {"est_uncertainty": "ours", "est_likelihood": "likelihood"}  # and the estimator that each acts on
+POLICIES = ("est_uncertainty", "est_likelihood")
 
 
 @dataclass
@@ -44,11 +44,11 @@ def main(cfg):
     if cfg.episodes == 1:
         raise UserError("--episodes 1: one tells no interval, say 2 or more")
     device, seed = command.device_of(cfg), first_seed(cfg)
-    paths = {("priv_on_state", 0): runs.find(cfg, "01_train_privileged", "policy.safetensors")}
-    paths |= {(m, 0): runs.find(cfg, "04_train_policy", "policy.safetensors", m) for m in POLICIES}
-    paths |= {kind: stacks.find_estimator(cfg, kind) for kind in KINDS}
-    world = runs.world_of(cfg, [path for several in paths.values() for path in (several if type(several) is list else [several])])
-    players = Players(cfg, paths, device, world)
+    policies = {("priv_on_state", 0): runs.find(cfg, "01_train_privileged", "policy.safetensors")}
+    policies |= {(m, 0): runs.find(cfg, "04_train_policy", "policy.safetensors", m) for m in POLICIES}
+    nets = {kind: stacks.find_estimator(cfg, kind) for kind in KINDS}
+    world = runs.world_of(cfg, [*policies.values(), *sum(nets.values(), [])])
+    players = Players(cfg, policies | nets, device, world)
     estimators = {kind: players.estimator(kind) for kind in KINDS}
 
     def predict(kind):
@@ -87,7 +87,7 @@ def main(cfg):
         success, length, env = players.chunk(Measurement(method, cfg.episodes, worlds=cfg.episodes), 0)
         states = np.concatenate([env.episode(i, n)["state"][:n] for i, n in enumerate(length)])
         rows.append(row("pi_priv, knows the pose" if method == "priv_on_state" else method, "anew", anew(states, length)))
-        if own := POLICIES.get(method):
+        if own := stacks.METHODS[method].estimator:
             rows.append(row(method, "as it saw them", as_seen(env, length)))
             told = statistics.in_the_loop(trajectories.in_the_loop(env, length, success, estimators[own].scale))
             rows.append(row(method, "its own estimate", {own: told}))
